@@ -1,0 +1,379 @@
+"""The options of every stage: one frozen dataclass each, the only home of a default.
+
+The command line is generated from these classes (a field is a flag, its metadata the help), a pipeline file
+in TOML overrides them, and the hash of their values decides what a resumed run may keep. Stages take a
+config at the door and hand plain arguments inwards.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import tomllib
+import types
+import typing
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, TypeVar
+
+from corrsfm.errors import ConfigError
+
+__all__ = [
+    "CameraMode",
+    "DatabaseConfig",
+    "Extractor",
+    "FeaturesConfig",
+    "ImagesConfig",
+    "Mapper",
+    "MatchesConfig",
+    "OperatingPoint",
+    "PairStrategy",
+    "PairsConfig",
+    "PipelineConfig",
+    "PruneConfig",
+    "PruneMethod",
+    "ReconstructionConfig",
+    "RunConfig",
+    "config_hash",
+    "from_dict",
+    "load_pipeline",
+]
+
+
+class CameraMode(StrEnum):
+    """Which photos share a camera."""
+
+    AUTO = "auto"
+    SINGLE = "single"
+    PER_FOLDER = "per-folder"
+    PER_IMAGE = "per-image"
+
+
+class Extractor(StrEnum):
+    """Implementations of SIFT."""
+
+    OPENCV = "opencv"
+    PYCOLMAP = "pycolmap"
+
+
+class PairStrategy(StrEnum):
+    """Ways to choose which photos are matched."""
+
+    AUTO = "auto"
+    EXHAUSTIVE = "exhaustive"
+    SEQUENTIAL = "sequential"
+    RETRIEVAL = "retrieval"
+    SPATIAL = "spatial"
+    FILE = "file"
+    COVISIBILITY = "covisibility"
+
+
+class PruneMethod(StrEnum):
+    """Ways to prune putative matches."""
+
+    NONE = "none"
+    RATIO = "ratio"
+    LORANSAC = "loransac"
+    MAGSAC = "magsac"
+    CORRADAPTOR = "corradaptor"
+    CASCADE = "cascade"
+
+
+class OperatingPoint(StrEnum):
+    """How strict the learned pruner is."""
+
+    SFM = "sfm"
+    POSE = "pose"
+
+
+class Mapper(StrEnum):
+    """pycolmap's mapping pipelines."""
+
+    INCREMENTAL = "incremental"
+    GLOBAL = "global"
+    HIERARCHICAL = "hierarchical"
+
+
+def option(
+    default: Any, text: str, *, unit: str = "", minimum: float | None = None, affects_result: bool = True
+) -> Any:
+    """A dataclass field with what the command line and the resume logic need to know about it.
+
+    Parameters
+    ----------
+    default : object
+    text : str
+        The help text, a sentence without its full stop.
+    unit : str
+        Unit shown in the help.
+    minimum : float, optional
+        Smallest valid value.
+    affects_result : bool
+        False for options of speed and memory only: they do not make finished work stale.
+    """
+    return field(
+        default=default,
+        metadata={"help": text, "unit": unit, "minimum": minimum, "affects_result": affects_result},
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagesConfig:
+    """Which photos, and what is known about their cameras."""
+
+    image_list: Path | None = option(None, "Text file with one photo name per line; only these are used")
+    mask_dir: Path | None = option(
+        None, "Folder of masks named like the photos plus '.png'; zero means ignore"
+    )
+    camera_mode: CameraMode = option(
+        CameraMode.AUTO, "Photos that share a camera; auto groups equal size, make, model and focal length"
+    )
+    camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
+    camera_params: str = option("", "Known intrinsics as comma-separated numbers in COLMAP's order")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeaturesConfig:
+    """SIFT extraction."""
+
+    extractor: Extractor = option(Extractor.OPENCV, "Which SIFT")
+    max_features: int = option(4096, "Keypoints kept per photo, strongest first", minimum=1)
+    max_image_size: int = option(
+        1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
+    )
+    root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairsConfig:
+    """Which photos are matched with each other."""
+
+    pairing: tuple[PairStrategy, ...] = option(
+        (PairStrategy.AUTO,),
+        "Strategy; give it several times for their union. auto: exhaustive up to 200 photos, then retrieval",
+    )
+    sequential_overlap: int = option(10, "Neighbours on each side in natural name order", minimum=1)
+    sequential_quadratic: bool = option(False, "Also pair photos 2, 4, 8 … apart")
+    loop_closure: bool = option(False, "Add retrieval pairs to a sequence, to close loops")
+    num_retrieved: int = option(30, "Most similar photos paired with each photo", minimum=1)
+    num_spatial: int = option(30, "Nearest photos by GPS paired with each photo", minimum=1)
+    max_distance_m: float = option(150.0, "Farthest GPS neighbour", unit="m", minimum=0)
+    pairs_file: Path | None = option(None, "Text file with 'name0 name1' per line, for the strategy file")
+    covisible_model: Path | None = option(None, "COLMAP model folder, for the strategy covisibility")
+    num_covisible: int = option(30, "Photos with most shared points paired with each photo", minimum=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchesConfig:
+    """Nearest-neighbour matching of descriptors."""
+
+    block_size: int = option(
+        4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PruneConfig:
+    """Pruning of putative matches."""
+
+    method: PruneMethod = option(PruneMethod.LORANSAC, "How putative matches are pruned")
+    model: Path | None = option(None, "Network checkpoint; the bundled one if not given")
+    operating_point: OperatingPoint = option(
+        OperatingPoint.SFM, "sfm keeps what mapping can use; pose is strict, for two-view poses"
+    )
+    max_ratio: float = option(0.8, "Largest descriptor distance ratio of the ratio test", minimum=0)
+    max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", minimum=0)
+    max_candidates: int = option(2000, "Matches per pair that the network sees, best ratio first", minimum=16)
+    max_batch_matches: int = option(
+        16000,
+        "Matches in one network batch, padding included; bounds memory",
+        minimum=16,
+        affects_result=False,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatabaseConfig:
+    """Geometric verification inside the COLMAP database."""
+
+    min_num_inliers: int = option(15, "Fewest verified matches of a pair that mapping may use", minimum=1)
+    verification_error_px: float = option(4.0, "Inlier threshold of the verification", unit="px", minimum=0)
+    write_descriptors: bool = option(False, "Also write descriptors, for tools that need them")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReconstructionConfig:
+    """Mapping by pycolmap."""
+
+    mapper: Mapper = option(Mapper.INCREMENTAL, "Mapping pipeline")
+    min_model_size: int = option(3, "Smallest model worth keeping", unit="photos", minimum=2)
+    multiple_models: bool = option(True, "Keep several models when the photos do not connect")
+    refine_principal_point: bool = option(False, "Also estimate the principal point")
+    snapshot_every: int = option(
+        0, "Write a snapshot every so many registered photos; 0 for none", minimum=0, affects_result=False
+    )
+    max_runtime_minutes: float = option(
+        0.0, "Stop mapping after so long and keep what there is; 0 for no limit", minimum=0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """How to run, rather than what to compute."""
+
+    seed: int = option(0, "Seed of everything random", minimum=0)
+    device: str = option("auto", "auto, cpu, cuda or cuda:N", affects_result=False)
+    threads: int = option(0, "Threads to use; 0 for all cores", minimum=0, affects_result=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PipelineConfig:
+    """All stages of a run; each field is a table of a pipeline file."""
+
+    images: ImagesConfig = field(default_factory=ImagesConfig)
+    features: FeaturesConfig = field(default_factory=FeaturesConfig)
+    pairs: PairsConfig = field(default_factory=PairsConfig)
+    matches: MatchesConfig = field(default_factory=MatchesConfig)
+    prune: PruneConfig = field(default_factory=PruneConfig)
+    database: DatabaseConfig = field(default_factory=DatabaseConfig)
+    reconstruction: ReconstructionConfig = field(default_factory=ReconstructionConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+
+
+T = TypeVar("T")
+
+
+def _convert(annotation: Any, value: Any) -> Any:
+    """Value from TOML or JSON as the type a field is annotated with; raises `ValueError` or `TypeError`."""
+    origin = typing.get_origin(annotation)
+    if origin in (typing.Union, types.UnionType):
+        inner = [a for a in typing.get_args(annotation) if a is not type(None)]
+        return None if value is None else _convert(inner[0], value)
+    if origin is tuple:
+        items = [value] if isinstance(value, str) else value
+        return tuple(_convert(typing.get_args(annotation)[0], item) for item in items)
+    if isinstance(annotation, type) and issubclass(annotation, StrEnum):
+        return annotation(value)
+    if annotation is Path:
+        return Path(value)
+    if annotation is float and type(value) is int:
+        return float(value)
+    if type(value) is not annotation:
+        raise TypeError
+    return value
+
+
+def _expected(annotation: Any) -> str:
+    choices = [
+        a
+        for a in (annotation, *typing.get_args(annotation))
+        if isinstance(a, type) and issubclass(a, StrEnum)
+    ]
+    if choices:
+        return "one of " + ", ".join(choices[0])
+    return getattr(annotation, "__name__", str(annotation))
+
+
+def check_minimums(config: Any, prefix: str = "") -> list[str]:
+    """Texts naming every value of a config below its minimum."""
+    problems = []
+    for entry in dataclasses.fields(config):
+        minimum = entry.metadata.get("minimum")
+        value = getattr(config, entry.name)
+        if minimum is not None and value < minimum:
+            problems.append(f"{prefix}{entry.name} is {value}, expected at least {minimum}")
+    return problems
+
+
+def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:
+    """Build a config from plain values.
+
+    Parameters
+    ----------
+    cls : type
+        A config dataclass, or `PipelineConfig` with nested tables.
+    values : dict
+    where : str
+        What the values come from, for messages.
+
+    Raises
+    ------
+    ConfigError
+        Listing every unknown key and wrong value at once, with the valid keys.
+    """
+    problems: list[str] = []
+    config = _build(cls, values, "", problems)
+    if problems:
+        raise ConfigError(f"{where}: " + "; ".join(problems))
+    return config
+
+
+def _build(cls: type[T], values: dict[str, Any], prefix: str, problems: list[str]) -> Any:
+    annotations = typing.get_type_hints(cls)
+    names = [entry.name for entry in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    arguments: dict[str, Any] = {}
+    for key, value in values.items():
+        name = key.replace("-", "_")
+        if name not in names:
+            problems.append(f"unknown key '{prefix}{key}', valid are {', '.join(names)}")
+        elif dataclasses.is_dataclass(annotations[name]):
+            if isinstance(value, dict):
+                arguments[name] = _build(typing.cast(type, annotations[name]), value, f"{name}.", problems)
+            else:
+                problems.append(f"'{prefix}{key}' must be a table")
+        else:
+            try:
+                arguments[name] = _convert(annotations[name], value)
+            except (TypeError, ValueError):
+                problems.append(f"{prefix}{key} is {value!r}, expected {_expected(annotations[name])}")
+    config = cls(**arguments)
+    if not prefix or cls is not PipelineConfig:
+        problems.extend(check_minimums(config, prefix))
+    return config
+
+
+def load_pipeline(path: Path) -> PipelineConfig:
+    """Read a pipeline file.
+
+    Raises
+    ------
+    ConfigError
+        If the file is missing, not TOML, or holds a key or value that does not exist.
+    """
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read ({error.strerror}); expected a pipeline file in TOML"
+        ) from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    return from_dict(PipelineConfig, values, str(path))
+
+
+def to_dict(config: Any, *, only_result: bool = False) -> dict[str, Any]:
+    """Plain values of a config, ready for JSON; with ``only_result`` without options of speed and memory."""
+    values: dict[str, Any] = {}
+    for entry in dataclasses.fields(config):
+        if only_result and not entry.metadata.get("affects_result", True):
+            continue
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            value = to_dict(value, only_result=only_result)
+        elif isinstance(value, Path):
+            value = value.as_posix()
+        elif isinstance(value, tuple):
+            value = [str(item) for item in value]
+        values[entry.name] = value
+    return values
+
+
+def config_hash(*parts: Any) -> str:
+    """Hex digest of configs, strings, numbers and nested lists of them; equal values give equal digests.
+
+    Options that do not affect results are left out.
+    """
+    plain = [to_dict(part, only_result=True) if dataclasses.is_dataclass(part) else part for part in parts]
+    return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()

@@ -1,0 +1,83 @@
+"""Errors that speak to the user.
+
+Every error a user can cause derives from `CorrsfmError`; the command line catches that one class, prints
+its text and exits non-zero. A text names the file or the pair, what was expected and what to try.
+
+::
+
+    CorrsfmError
+    ├── ConfigError            an option or a pipeline file is wrong
+    ├── InputError             the photos, lists or models handed in cannot be used
+    │   └── ImageError         one photo cannot be used
+    ├── WorkspaceError         a workspace is missing something, is damaged, locked or of another version
+    ├── CheckpointError        a network checkpoint is not what it should be
+    ├── DatabaseError          the COLMAP database cannot be read or written
+    ├── ReconstructionError    mapping produced no model
+    └── DependencyError        an optional package is needed and absent
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "CorrsfmError",
+    "DatabaseError",
+    "DependencyError",
+    "ImageError",
+    "InputError",
+    "ReconstructionError",
+    "WorkspaceError",
+]
+
+
+class CorrsfmError(Exception):
+    """Root of all errors that corrsfm raises on purpose."""
+
+
+class ConfigError(CorrsfmError):
+    """An option or a pipeline file holds a name or a value that does not exist."""
+
+
+class InputError(CorrsfmError):
+    """Photos, lists or models handed in by the user cannot be used."""
+
+
+class ImageError(InputError):
+    """One photo cannot be used; the text begins with its name."""
+
+
+class WorkspaceError(CorrsfmError):
+    """A workspace misses an artefact, holds a damaged one, is locked or of another version."""
+
+
+class CheckpointError(CorrsfmError):
+    """A network checkpoint is damaged, of an unknown format or of another network."""
+
+
+class DatabaseError(CorrsfmError):
+    """A COLMAP database cannot be read or written."""
+
+
+class ReconstructionError(CorrsfmError):
+    """Mapping ended without a model."""
+
+
+class DependencyError(CorrsfmError):
+    """An optional package is needed for this operation and is not installed.
+
+    Parameters
+    ----------
+    package : str
+        The package's name on the index.
+    purpose : str
+        What it is needed for, as the end of "… is needed for".
+    extra : str
+        The extra of corrsfm that brings it.
+    """
+
+    def __init__(self, package: str, purpose: str, extra: str) -> None:
+        super().__init__(
+            f"the package '{package}' is needed for {purpose} and is not installed; "
+            f"try: pip install 'corrsfm[{extra}]'"
+        )

@@ -1,0 +1,296 @@
+"""The frozen records that stages exchange, and the one statement of the conventions they follow.
+
+Pixels
+    COLMAP's convention everywhere in memory: the centre of the first pixel is (0.5, 0.5), x to the right,
+    y down. HDF5 files follow hloc and put it at (0, 0); `corrsfm.store` converts, nothing else does.
+Normalised coordinates
+    ``(x, y)`` such that ``(x, y, 1)`` is the viewing ray in the camera frame (x right, y down, z forward).
+Images of a pair
+    are ``0`` and ``1``; transforms are named ``cam1_from_cam0``; an essential matrix fulfils
+    ``x1ᵀ E x0 = 0``.
+Names
+    An image's name is its posix path relative to the image folder; it is the only key that is ever used.
+
+Shapes and dtypes are checked once, here, at construction; a mismatch raises `ValueError` because it is a
+programming error, not a user's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "Camera",
+    "Correspondences",
+    "Features",
+    "ImageRecord",
+    "Matches",
+    "Pair",
+    "PairList",
+    "PruneResult",
+    "TwoViewModel",
+]
+
+Pair = tuple[str, str]
+"""Two image names; the order is the orientation of everything stored for the pair."""
+
+
+def _check(name: str, array: NDArray, shape: tuple[int | None, ...], dtype: type) -> None:
+    if array.dtype != np.dtype(dtype):
+        raise ValueError(f"{name}: expected dtype {np.dtype(dtype)}, got {array.dtype}")
+    if array.ndim != len(shape) or any(
+        s is not None and s != a for s, a in zip(shape, array.shape, strict=True)
+    ):
+        raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera:
+    """A camera as COLMAP describes it.
+
+    Attributes
+    ----------
+    model : str
+        COLMAP camera model name, such as ``SIMPLE_RADIAL``.
+    width, height : int
+        Image size in pixels, as stored in the file (EXIF orientation not applied).
+    params : tuple of float
+        Model parameters in COLMAP's order; focal lengths and principal point in pixels.
+    has_prior_focal_length : bool
+        True if the focal length comes from EXIF or the user rather than from a guess.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+    has_prior_focal_length: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageRecord:
+    """One photo of a scene.
+
+    Attributes
+    ----------
+    name : str
+        Posix path relative to the image folder.
+    camera_id : int
+        Index into the scene's cameras, from 0.
+    sha256 : str
+        Hash of the file's bytes; part of every fingerprint that depends on the photo.
+    mask : str or None
+        Path of the mask relative to the mask folder, if there is one. Zero means "ignore".
+    mask_sha256 : str or None
+        Hash of the mask's bytes.
+    gps : tuple of float or None
+        Latitude and longitude in degrees, altitude in metres (WGS84), from EXIF.
+    """
+
+    name: str
+    camera_id: int
+    sha256: str
+    mask: str | None = None
+    mask_sha256: str | None = None
+    gps: tuple[float, float, float] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Features:
+    """Keypoints and descriptors of one image; N may be 0.
+
+    Attributes
+    ----------
+    keypoints : (N, 2) float32
+        Pixels of the original image, COLMAP convention.
+    scales : (N,) float32
+        Keypoint sizes (standard deviation σ of the SIFT scale) in pixels.
+    orientations : (N,) float32
+        Keypoint orientations in radians, in [-π, π), from the x axis towards the y axis.
+    scores : (N,) float32
+        Detector responses; larger is stronger.
+    descriptors : (N, D) uint8
+        Descriptors, quantised the way COLMAP does (unit vector × 512, clipped to 255).
+    image_size : tuple of int
+        Width and height in pixels.
+    """
+
+    keypoints: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    orientations: NDArray[np.float32]
+    scores: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    image_size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        num = len(self.keypoints)
+        _check("keypoints", self.keypoints, (num, 2), np.float32)
+        _check("scales", self.scales, (num,), np.float32)
+        _check("orientations", self.orientations, (num,), np.float32)
+        _check("scores", self.scores, (num,), np.float32)
+        _check("descriptors", self.descriptors, (num, None), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Matches:
+    """Putative matches of one pair, before any filter; M may be 0.
+
+    One match for every keypoint of image 0 that has a nearest neighbour in image 1, ordered by the index in
+    image 0, so that every later filter can be tried without matching again.
+
+    Attributes
+    ----------
+    indices : (M, 2) int32
+        Keypoint indices in image 0 and image 1; column 0 strictly increases.
+    ratios : (M,) float32
+        Distance to the nearest over distance to the second nearest descriptor, in [0, 1].
+    mutual : (M,) bool
+        True where the match is also the nearest neighbour from image 1 to image 0.
+    """
+
+    indices: NDArray[np.int32]
+    ratios: NDArray[np.float32]
+    mutual: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        num = len(self.indices)
+        _check("indices", self.indices, (num, 2), np.int32)
+        _check("ratios", self.ratios, (num,), np.float32)
+        _check("mutual", self.mutual, (num,), np.bool_)
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairList:
+    """The pairs to match and where each came from.
+
+    Attributes
+    ----------
+    pairs : tuple of Pair
+        Without repetition in either orientation, sorted.
+    origins : tuple of tuple of str
+        For each pair the sorted names of the strategies that proposed it.
+    """
+
+    pairs: tuple[Pair, ...]
+    origins: tuple[tuple[str, ...], ...]
+
+    def __post_init__(self) -> None:
+        if len(self.pairs) != len(self.origins):
+            raise ValueError(f"{len(self.pairs)} pairs but {len(self.origins)} origins")
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correspondences:
+    """Everything a prune method may know about the putative matches of one pair; M may be 0.
+
+    Attributes
+    ----------
+    points0, points1 : (M, 2) float32
+        Matched keypoints in pixels, COLMAP convention.
+    normalised : (M, 4) float32
+        ``x0 y0 x1 y1`` normalised by the intrinsics known before reconstruction.
+    ratios : (M,) float32
+        Ratio of the two nearest descriptor distances.
+    mutual : (M,) bool
+        Mutual nearest neighbours.
+    log_scale_ratios : (M,) float32
+        Natural logarithm of scale in image 1 over scale in image 0.
+    rotations : (M,) float32
+        Orientation in image 1 minus orientation in image 0, radians, wrapped to [-π, π).
+    camera0, camera1 : Camera
+        The cameras that ``normalised`` was made with.
+    name : str
+        ``"name0 – name1"`` for messages.
+    """
+
+    points0: NDArray[np.float32]
+    points1: NDArray[np.float32]
+    normalised: NDArray[np.float32]
+    ratios: NDArray[np.float32]
+    mutual: NDArray[np.bool_]
+    log_scale_ratios: NDArray[np.float32]
+    rotations: NDArray[np.float32]
+    camera0: Camera
+    camera1: Camera
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        num = len(self.points0)
+        _check("points0", self.points0, (num, 2), np.float32)
+        _check("points1", self.points1, (num, 2), np.float32)
+        _check("normalised", self.normalised, (num, 4), np.float32)
+        _check("ratios", self.ratios, (num,), np.float32)
+        _check("mutual", self.mutual, (num,), np.bool_)
+        _check("log_scale_ratios", self.log_scale_ratios, (num,), np.float32)
+        _check("rotations", self.rotations, (num,), np.float32)
+
+    def __len__(self) -> int:
+        return len(self.points0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwoViewModel:
+    """A two-view geometry.
+
+    Attributes
+    ----------
+    kind : {"essential", "fundamental", "homography"}
+        What the matrix is; essential matrices act on normalised coordinates, the others on pixels.
+    matrix : (3, 3) float64
+        Maps image 0 to image 1.
+    """
+
+    kind: Literal["essential", "fundamental", "homography"]
+    matrix: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        _check("matrix", self.matrix, (3, 3), np.float64)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PruneResult:
+    """What a prune method says about the putative matches of one pair.
+
+    Attributes
+    ----------
+    scores : (M,) float32
+        Confidence that a match is right, in [0, 1], in the order of the putative matches.
+    inlier_mask : (M,) bool
+        The matches to keep. A pair pruned to nothing has no True entry and stays recorded.
+    model : TwoViewModel or None
+        The geometry the method settled on, if it estimates one.
+    residuals : (M,) float32
+        Squared symmetric epipolar distances to the model in normalised coordinates; NaN without a model.
+    decided_by : str
+        Which branch of a composite method decided (for `cascade`), else the method's name.
+    """
+
+    scores: NDArray[np.float32]
+    inlier_mask: NDArray[np.bool_]
+    model: TwoViewModel | None = None
+    residuals: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    decided_by: str = ""
+
+    def __post_init__(self) -> None:
+        num = len(self.scores)
+        _check("scores", self.scores, (num,), np.float32)
+        _check("inlier_mask", self.inlier_mask, (num,), np.bool_)
+        if len(self.residuals) != num:
+            object.__setattr__(self, "residuals", np.full(num, np.nan, np.float32))
+        _check("residuals", self.residuals, (num,), np.float32)
+
+    def __len__(self) -> int:
+        return len(self.scores)
