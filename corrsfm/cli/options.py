@@ -1,0 +1,115 @@
+"""Shared options: flags generated from the config dataclasses, and the ones every command has."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import typing
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import click
+
+from corrsfm import config as cfg
+
+__all__ = ["config_options", "echo_json", "json_option", "overwrite_option", "run_options"]
+
+F = typing.TypeVar("F", bound=Callable[..., Any])
+
+
+def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
+    """One click option for one config field."""
+    flag = "--" + entry.name.replace("_", "-")
+    inner = next(
+        (a for a in typing.get_args(annotation) if a is not type(None) and a is not Ellipsis), annotation
+    )
+    text = entry.metadata["help"]
+    if unit := entry.metadata["unit"]:
+        text += f" [{unit}]"
+    settings: dict[str, Any] = {"help": text + ".", "default": entry.default, "show_default": True}
+    if annotation is bool:
+        return click.option(f"{flag}/--no-{flag[2:]}", **settings)
+    if isinstance(inner, type) and issubclass(inner, StrEnum):
+        settings["type"] = click.Choice([str(member) for member in inner])
+        if typing.get_origin(annotation) is tuple:
+            defaults = typing.cast(tuple[StrEnum, ...], entry.default)
+            settings |= {"multiple": True, "default": [str(member) for member in defaults]}
+    elif inner is Path:
+        settings |= {"type": click.Path(path_type=Path), "show_default": False}
+    elif inner in (int, float):
+        settings["type"] = inner
+    else:
+        settings["show_default"] = bool(entry.default)
+    return click.option(flag, entry.name, **settings)
+
+
+def config_options(**configs: type) -> Callable[[F], F]:
+    """Give a command a flag for every field of the named config dataclasses.
+
+    ``@config_options(features=FeaturesConfig)`` calls the command with ``features=FeaturesConfig(...)``. If
+    the command has an option ``--pipeline``, its file is read first and only flags that the user really typed
+    override it.
+
+    Raises
+    ------
+    ConfigError
+        If a value is below its minimum, naming all of them.
+    """
+
+    def decorate(command: F) -> F:
+        @functools.wraps(command)
+        def wrapped(*args: Any, **kwargs: Any) -> Any:
+            context = click.get_current_context()
+            pipeline_file = kwargs.get("pipeline")
+            base = cfg.load_pipeline(pipeline_file) if pipeline_file else cfg.PipelineConfig()
+            for keyword, cls in configs.items():
+                given = {}
+                for entry in dataclasses.fields(cls):
+                    value = kwargs.pop(entry.name)
+                    if context.get_parameter_source(entry.name) is not click.core.ParameterSource.DEFAULT:
+                        given[entry.name] = value
+                kwargs[keyword] = _override(getattr(base, keyword, None) or cls(), given)
+            return command(*args, **kwargs)
+
+        for cls in reversed(configs.values()):
+            annotations = typing.get_type_hints(cls)
+            for entry in reversed(dataclasses.fields(cls)):
+                wrapped = _option(entry, annotations[entry.name])(wrapped)
+        return typing.cast(F, wrapped)
+
+    return decorate
+
+
+def _override(base: Any, given: dict[str, Any]) -> Any:
+    """A config with the given values from the command line, checked."""
+    checked = cfg.from_dict(type(base), given, "command line")
+    return dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
+
+
+def run_options(command: F) -> F:
+    """``--seed``, ``--device`` and ``--threads``; the command is called with ``run=RunConfig(...)``."""
+    return config_options(run=cfg.RunConfig)(command)
+
+
+def overwrite_option(command: F) -> F:
+    """``--overwrite``; without it finished work is kept."""
+    return click.option(
+        "--overwrite",
+        is_flag=True,
+        help="Redo finished work; without it only what is missing or stale is done.",
+    )(command)
+
+
+def json_option(command: F) -> F:
+    """``--json``; the command is called with ``as_json``."""
+    return click.option(
+        "--json", "as_json", is_flag=True, help="Print the result as JSON on standard output."
+    )(command)
+
+
+def echo_json(value: Any) -> None:
+    """Print a value as JSON on standard output."""
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False, default=str))

@@ -1,0 +1,411 @@
+"""Features, matches and pruned matches on disk: HDF5 in hloc's layout, with a journal that survives a kill.
+
+Layout (hloc's, so that its tools read these files; differences are noted)
+    ``features.h5``: group = image name; ``keypoints`` (N, 2) float32 with the first pixel's centre at (0, 0),
+    ``scores`` (N,) float32, ``descriptors`` (D, N) float16 = uint8 / 512, which is exact, ``image_size`` (2,)
+    int32, and beyond hloc ``scales`` and ``oris`` (N,) float32.
+    ``matches.h5`` and ``pruned.h5``: group = ``name0/name1`` with slashes inside a name as dashes;
+    ``matches0`` (N0,) int32 with -1 for none and ``matching_scores0`` (N0,) float32. Putative matches score
+    1 − ratio and carry ``mutual0`` (N0,) bool; pruned ones carry the score of the prune method.
+    Every group has the attribute ``fingerprint``; the root has ``format`` and ``version``.
+
+Crash safety
+    An HDF5 file that is killed while being written is lost as a whole. So finished items go to a SQLite
+    journal next to the file, one transaction each, and the HDF5 file is written in one go and renamed into
+    place when its stage is complete. A killed process loses at most the item in work.
+"""
+
+from __future__ import annotations
+
+import io
+import sqlite3
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.types import Features, Matches, Pair, PruneResult, TwoViewModel
+from corrsfm.workspace import atomic_path
+
+__all__ = ["FEATURES", "MATCHES", "PRUNED", "ItemStore", "PrunedMatches", "check_hloc_keys"]
+
+FORMAT_VERSION = 1
+HALF_PIXEL = np.float32(0.5)
+
+K = TypeVar("K", bound=Hashable)
+T = TypeVar("T")
+Arrays = dict[str, NDArray[Any]]
+Attributes = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrunedMatches:
+    """What `pruned.h5` keeps of a pair.
+
+    Attributes
+    ----------
+    indices : (K, 2) int32
+        The kept matches, in the order of the putative ones. K may be 0.
+    scores : (K,) float32
+    num_putative : int
+        Number of matches before pruning.
+    model : TwoViewModel or None
+    decided_by : str
+    """
+
+    indices: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    num_putative: int
+    model: TwoViewModel | None = None
+    decided_by: str = ""
+
+    @classmethod
+    def from_result(cls, matches: Matches, result: PruneResult) -> PrunedMatches:
+        """The kept part of a prune method's result."""
+        return cls(
+            indices=matches.indices[result.inlier_mask],
+            scores=result.scores[result.inlier_mask],
+            num_putative=len(matches),
+            model=result.model,
+            decided_by=result.decided_by,
+        )
+
+
+@dataclass(frozen=True)
+class Kind(Generic[K, T]):
+    """How one kind of item is named and laid out.
+
+    Attributes
+    ----------
+    label : str
+        The root attribute ``format`` is ``corrsfm-<label>``.
+    group : callable
+        Key to HDF5 group path.
+    encode, decode : callable
+        Item to datasets and attributes, and back.
+    """
+
+    label: str
+    group: Callable[[K], str]
+    encode: Callable[[T], tuple[Arrays, Attributes]]
+    decode: Callable[[Mapping[str, Any], Mapping[str, Any]], T]
+
+
+def _encode_features(features: Features) -> tuple[Arrays, Attributes]:
+    return {
+        "keypoints": features.keypoints - HALF_PIXEL,
+        "scales": features.scales,
+        "oris": features.orientations,
+        "scores": features.scores,
+        "descriptors": np.ascontiguousarray((features.descriptors.astype(np.float16) / np.float16(512)).T),
+        "image_size": np.asarray(features.image_size, np.int32),
+    }, {}
+
+
+def _decode_features(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Features:
+    """Ours or hloc's: what hloc does not write gets a neutral value."""
+    keypoints = np.asarray(arrays["keypoints"], np.float32) + HALF_PIXEL
+    num = len(keypoints)
+    descriptors = np.asarray(arrays["descriptors"], np.float32).T
+    width, height = (int(value) for value in np.asarray(arrays["image_size"]))
+
+    def vector(name: str, default: float) -> NDArray[np.float32]:
+        return np.asarray(arrays[name], np.float32) if name in arrays else np.full(num, default, np.float32)
+
+    return Features(
+        keypoints=keypoints,
+        scales=vector("scales", 1.0),
+        orientations=vector("oris", 0.0),
+        scores=vector("scores", 1.0),
+        descriptors=np.clip(np.rint(descriptors * 512), 0, 255).astype(np.uint8),
+        image_size=(width, height),
+    )
+
+
+def _scatter(num: int, indices: NDArray[np.int32], scores: NDArray[np.float32]) -> Arrays:
+    """hloc's one-entry-per-keypoint layout."""
+    matches0 = np.full(num, -1, np.int32)
+    scores0 = np.zeros(num, np.float32)
+    matches0[indices[:, 0]] = indices[:, 1]
+    scores0[indices[:, 0]] = scores
+    return {"matches0": matches0, "matching_scores0": scores0}
+
+
+def _gather(arrays: Mapping[str, Any]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    matches0 = np.asarray(arrays["matches0"], np.int32)
+    kept = np.flatnonzero(matches0 >= 0)
+    indices = np.column_stack([kept, matches0[kept]]).astype(np.int32)
+    return indices, np.asarray(arrays["matching_scores0"], np.float32)[kept]
+
+
+def _num_rows(indices: NDArray[np.int32]) -> int:
+    return int(indices[-1, 0]) + 1 if len(indices) else 0
+
+
+def _encode_matches(matches: Matches) -> tuple[Arrays, Attributes]:
+    num = _num_rows(matches.indices)
+    arrays = _scatter(num, matches.indices, np.float32(1) - matches.ratios)
+    arrays["mutual0"] = np.zeros(num, np.bool_)
+    arrays["mutual0"][matches.indices[:, 0]] = matches.mutual
+    return arrays, {}
+
+
+def _decode_matches(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Matches:
+    indices, scores = _gather(arrays)
+    # hloc's own matchers do not say which matches are mutual; its default matcher keeps only mutual ones.
+    mutual = (
+        np.asarray(arrays["mutual0"], np.bool_)[indices[:, 0]]
+        if "mutual0" in arrays
+        else np.ones(len(indices), bool)
+    )
+    return Matches(indices=indices, ratios=np.clip(np.float32(1) - scores, 0, 1), mutual=mutual)
+
+
+def _encode_pruned(pruned: PrunedMatches) -> tuple[Arrays, Attributes]:
+    arrays = _scatter(_num_rows(pruned.indices), pruned.indices, pruned.scores)
+    attributes: Attributes = {"num_putative": pruned.num_putative, "decided_by": pruned.decided_by}
+    if pruned.model is not None:
+        arrays["model"] = pruned.model.matrix
+        attributes["model_kind"] = pruned.model.kind
+    return arrays, attributes
+
+
+def _decode_pruned(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> PrunedMatches:
+    indices, scores = _gather(arrays)
+    model = None
+    if "model" in arrays:
+        model = TwoViewModel(kind=attributes["model_kind"], matrix=np.asarray(arrays["model"], np.float64))
+    return PrunedMatches(
+        indices=indices,
+        scores=scores,
+        num_putative=int(attributes["num_putative"]),
+        model=model,
+        decided_by=str(attributes["decided_by"]),
+    )
+
+
+def _pair_group(pair: Pair) -> str:
+    return "/".join(name.replace("/", "-") for name in pair)
+
+
+FEATURES: Kind[str, Features] = Kind("features", str, _encode_features, _decode_features)
+MATCHES: Kind[Pair, Matches] = Kind("matches", _pair_group, _encode_matches, _decode_matches)
+PRUNED: Kind[Pair, PrunedMatches] = Kind("pruned", _pair_group, _encode_pruned, _decode_pruned)
+
+
+def check_hloc_keys(names: Iterable[str]) -> None:
+    """Refuse names that hloc's layout cannot tell apart.
+
+    Raises
+    ------
+    InputError
+        Naming the two photos.
+    """
+    seen: dict[str, str] = {}
+    for name in names:
+        key = name.replace("/", "-")
+        if key in seen:
+            raise InputError(
+                f"the photos '{seen[key]}' and '{name}' would share the key '{key}' in the match files; "
+                "rename one"
+            )
+        seen[key] = name
+
+
+class ItemStore(Generic[K, T]):
+    """Items of one kind in an HDF5 file, with a journal of those finished since it was written.
+
+    Parameters
+    ----------
+    path : Path
+        The HDF5 file; the journal lies beside it with the suffix ``.journal``.
+    kind : Kind
+    """
+
+    def __init__(self, path: Path, kind: Kind[K, T]) -> None:
+        self.path = path
+        self.kind = kind
+        self.journal_path = path.with_suffix(path.suffix + ".journal")
+        self._journal: sqlite3.Connection | None = None
+
+    # reading ------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _open(self) -> Iterator[h5py.File]:
+        try:
+            file = h5py.File(self.path, "r")
+        except FileNotFoundError as error:
+            raise WorkspaceError(f"{self.path}: missing; run the step that makes it") from error
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.path}: not a readable HDF5 file ({error}); delete it and run again"
+            ) from error
+        with file:
+            version = file.attrs.get("version", FORMAT_VERSION)
+            if version != FORMAT_VERSION:
+                raise WorkspaceError(
+                    f"{self.path}: format version {version}, this corrsfm reads {FORMAT_VERSION}"
+                )
+            yield file
+
+    @contextmanager
+    def reader(self) -> Iterator[Callable[[K], T]]:
+        """Open the file once and yield a function that reads an item by key.
+
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing or unreadable, or (from the function) if it holds no such item.
+        """
+        with self._open() as file:
+
+            def read(key: K) -> T:
+                group = file.get(self.kind.group(key))
+                if group is None:
+                    raise WorkspaceError(
+                        f"{self.path}: holds nothing for {key}; run the step that makes it again"
+                    )
+                arrays = {name: value[()] for name, value in group.items() if isinstance(value, h5py.Dataset)}
+                try:
+                    return self.kind.decode(arrays, group.attrs)
+                except KeyError as error:
+                    raise WorkspaceError(
+                        f"{self.path}: {key} lacks {error}; delete the file and run again"
+                    ) from error
+
+            yield read
+
+    def read(self, key: K) -> T:
+        """Read one item; see `reader`."""
+        with self.reader() as read:
+            return read(key)
+
+    def finished(self, wanted: Mapping[K, str]) -> set[K]:
+        """Keys whose item is already there with the wanted fingerprint, in the file or the journal."""
+        found: set[K] = set()
+        if self.path.exists():
+            with self._open() as file:
+                for key, fingerprint in wanted.items():
+                    group = file.get(self.kind.group(key))
+                    if group is not None and group.attrs.get("fingerprint") == fingerprint:
+                        found.add(key)
+        if self.journal_path.exists():
+            rows = dict(self._connection().execute("SELECT key, fingerprint FROM items"))
+            found |= {
+                key for key, fingerprint in wanted.items() if rows.get(self.kind.group(key)) == fingerprint
+            }
+        return found
+
+    # writing ------------------------------------------------------------------------------------------------
+
+    def _connection(self) -> sqlite3.Connection:
+        if self._journal is None:
+            try:
+                self._journal = self._open_journal()
+            except sqlite3.DatabaseError:
+                # A journal that cannot be read holds nothing worth more than starting it afresh.
+                self.discard_journal()
+                self._journal = self._open_journal()
+        return self._journal
+
+    def _open_journal(self) -> sqlite3.Connection:
+        connection = sqlite3.connect(self.journal_path, isolation_level=None)
+        # In WAL mode a killed process loses only the transaction in work.
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("PRAGMA synchronous=NORMAL")
+        connection.execute(
+            "CREATE TABLE IF NOT EXISTS items (key TEXT PRIMARY KEY, fingerprint TEXT, item BLOB)"
+        )
+        return connection
+
+    def add(self, key: K, fingerprint: str, item: T) -> None:
+        """Put an item into the journal; it is safe when this returns.
+
+        Raises
+        ------
+        WorkspaceError
+            If the disk is full or the journal cannot be written.
+        """
+        arrays, attributes = self.kind.encode(item)
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays, **{f"@{name}": np.asarray(value) for name, value in attributes.items()})  # type: ignore[arg-type]
+        try:
+            self._connection().execute(
+                "INSERT OR REPLACE INTO items VALUES (?, ?, ?)",
+                (self.kind.group(key), fingerprint, buffer.getvalue()),
+            )
+        except sqlite3.OperationalError as error:
+            raise WorkspaceError(
+                f"{self.journal_path}: cannot be written ({error}); free some disk space and run again, "
+                "finished work is kept"
+            ) from error
+
+    def commit(self, wanted: Mapping[K, str]) -> None:
+        """Make the HDF5 file hold exactly the wanted items, from itself and the journal; all or nothing.
+
+        Raises
+        ------
+        WorkspaceError
+            If an item is in neither, or the disk is full.
+        """
+        try:
+            with atomic_path(self.path) as temporary, h5py.File(temporary, "w") as target:
+                target.attrs["format"] = f"corrsfm-{self.kind.label}"
+                target.attrs["version"] = FORMAT_VERSION
+                self._fill(target, wanted)
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.path}: cannot be written ({error}); free some disk space and run again, "
+                "finished work is kept"
+            ) from error
+        self.discard_journal()
+
+    def _fill(self, target: h5py.File, wanted: Mapping[K, str]) -> None:
+        source = h5py.File(self.path, "r") if self.path.exists() else None
+        try:
+            for key, fingerprint in wanted.items():
+                name = self.kind.group(key)
+                row = (
+                    self._connection()
+                    .execute("SELECT item FROM items WHERE key = ? AND fingerprint = ?", (name, fingerprint))
+                    .fetchone()
+                )
+                if row is not None:
+                    self._write_group(target, name, fingerprint, row[0])
+                elif source is not None and source.get(name) is not None:
+                    source.copy(source[name], target, name=name, shallow=False)
+                else:
+                    raise WorkspaceError(f"{self.path}: {key} was never finished; run again")
+        finally:
+            if source is not None:
+                source.close()
+
+    @staticmethod
+    def _write_group(target: h5py.File, name: str, fingerprint: str, blob: bytes) -> None:
+        group = target.create_group(name)
+        group.attrs["fingerprint"] = fingerprint
+        with np.load(io.BytesIO(blob), allow_pickle=False) as arrays:
+            for entry in arrays.files:
+                if entry.startswith("@"):
+                    value = arrays[entry].item()
+                    group.attrs[entry[1:]] = value
+                else:
+                    group.create_dataset(entry, data=arrays[entry])
+
+    def discard_journal(self) -> None:
+        """Forget everything that is only in the journal."""
+        self.close()
+        for suffix in ("", "-wal", "-shm"):
+            Path(f"{self.journal_path}{suffix}").unlink(missing_ok=True)
+
+    def close(self) -> None:
+        """Close the journal; its items stay for the next run."""
+        if self._journal is not None:
+            self._journal.close()
+            self._journal = None
