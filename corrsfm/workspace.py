@@ -18,7 +18,7 @@
     └── log.txt             what pycolmap had to say
 
 Every file is written under another name and renamed, so a file that exists is whole. A stage is current if
-its recorded fingerprint, a hash of its options and of the fingerprints of what it read, equals the one wanted.
+its recorded fingerprint, a hash of its options and of the fingerprints of its inputs, equals the wanted one.
 """
 
 from __future__ import annotations
