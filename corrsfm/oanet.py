@@ -1,0 +1,299 @@
+"""Labelled two-view pairs, and the HDF5 layout of OANet that the pruning literature exchanges them in.
+
+The layout has one group per quantity with one dataset per pair, named by a running index::
+
+    xs (1, N, 4)   x0 y0 x1 y1 normalised            Rs (3, 3), ts (3, 1)   cam1_from_cam0
+    ys (N, 1)      squared symmetric epipolar        cx0 … : cx1s cy1s f1s of image 0 (called 1 there),
+                   distance to the true geometry              cx2s cy2s f2s of image 1, in pixels
+    ratios (N,), mutuals (N,)
+
+Principal points there count from the centre of the first pixel, ours from its corner; this module converts.
+``f`` is one focal length or two (x, y). Files written here carry four groups more, which other readers do
+not look at and which are optional here: ``log_scale_ratios``, ``rotations`` (N,), ``sizes`` (2, 2) and the
+string ``scenes``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.errors import InputError
+from corrsfm.types import Camera, Correspondences
+from corrsfm.workspace import atomic_path
+
+__all__ = ["OANetPair", "count_pairs", "read_pairs", "select_per_scene", "write_pairs"]
+
+_REQUIRED = ("xs", "ys", "Rs", "ts", "ratios", "mutuals", "cx1s", "cy1s", "cx2s", "cy2s", "f1s", "f2s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OANetPair:
+    """Putative matches of two images and the true geometry between them; N may be 0.
+
+    Attributes
+    ----------
+    correspondences : (N, 4) float32
+        ``x0 y0 x1 y1``, normalised by the cameras below.
+    label_distances : (N,) float32
+        Squared symmetric epipolar distance to the true geometry, normalised units. Right matches are those
+        below 1e-4.
+    rotation : (3, 3) float64
+        Of ``cam1_from_cam0``.
+    translation : (3,) float64
+        Of ``cam1_from_cam0``, any length.
+    ratios : (N,) float32
+        Distance ratio of the two nearest descriptors.
+    mutual : (N,) bool
+        Mutual nearest neighbours.
+    log_scale_ratios : (N,) float32
+        Logarithm of keypoint scale in image 1 over image 0; zeros if unknown.
+    rotations : (N,) float32
+        Keypoint orientation in image 1 minus image 0, radians; zeros if unknown.
+    camera0, camera1 : Camera
+        ``PINHOLE`` cameras, pixels in COLMAP's convention.
+    scene : str
+        Name of the place, "" if unknown.
+    name : str
+        Name of the pair for messages.
+    """
+
+    correspondences: NDArray[np.float32]
+    label_distances: NDArray[np.float32]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    ratios: NDArray[np.float32]
+    mutual: NDArray[np.bool_]
+    log_scale_ratios: NDArray[np.float32]
+    rotations: NDArray[np.float32]
+    camera0: Camera
+    camera1: Camera
+    scene: str = ""
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        num = len(self.correspondences)
+        expected = {
+            "correspondences": (num, 4),
+            "label_distances": (num,),
+            "rotation": (3, 3),
+            "translation": (3,),
+            "ratios": (num,),
+            "mutual": (num,),
+            "log_scale_ratios": (num,),
+            "rotations": (num,),
+        }
+        for field, shape in expected.items():
+            if getattr(self, field).shape != shape:
+                raise ValueError(f"{field}: expected shape {shape}, got {getattr(self, field).shape}")
+
+    def __len__(self) -> int:
+        return len(self.correspondences)
+
+    def inliers(self, threshold: float = 1e-4) -> NDArray[np.bool_]:
+        """True where a match is right: squared symmetric epipolar distance below the threshold."""
+        return self.label_distances < threshold
+
+    def as_correspondences(self) -> Correspondences:
+        """The same matches as prune methods take them, without the truth."""
+        points = [
+            _to_pixels(camera, self.correspondences[:, columns])
+            for camera, columns in ((self.camera0, slice(0, 2)), (self.camera1, slice(2, 4)))
+        ]
+        return Correspondences(
+            points0=points[0],
+            points1=points[1],
+            normalised=self.correspondences,
+            ratios=self.ratios,
+            mutual=self.mutual,
+            log_scale_ratios=self.log_scale_ratios,
+            rotations=self.rotations,
+            camera0=self.camera0,
+            camera1=self.camera1,
+            name=self.name,
+        )
+
+
+def _to_pixels(camera: Camera, normalised: NDArray[np.float32]) -> NDArray[np.float32]:
+    fx, fy, cx, cy = camera.params
+    return (normalised * np.array([fx, fy]) + np.array([cx, cy])).astype(np.float32)
+
+
+def _open(path: Path) -> h5py.File:
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read as HDF5 ({error}); expected a file of labelled pairs in OANet's layout"
+        ) from error
+
+
+def count_pairs(path: Path) -> int:
+    """Number of pairs in a file.
+
+    Raises
+    ------
+    InputError
+        If it is not a file in OANet's layout.
+    """
+    with _open(path) as handle:
+        return len(_indices(handle, path))
+
+
+def _indices(handle: h5py.File, path: Path) -> list[str]:
+    missing = [name for name in _REQUIRED if name not in handle]
+    if missing:
+        raise InputError(
+            f"{path}: lacks the groups {', '.join(missing)} of OANet's layout; "
+            "make such a file with: corrsfm train prepare"
+        )
+    # h5py lists names as text, "10" before "2"; pairs are numbered.
+    return sorted(handle["xs"], key=lambda name: (len(name), name))
+
+
+def _camera(handle: h5py.File, index: str, image: int) -> Camera:
+    """Camera of image 0 or 1, called 1 and 2 in the file."""
+    focal = np.asarray(handle[f"f{image + 1}s"][index], np.float64).ravel()
+    centre = [float(np.asarray(handle[f"c{axis}{image + 1}s"][index]).ravel()[0]) for axis in "xy"]
+    if "sizes" in handle and index in handle["sizes"]:
+        width, height = (int(side) for side in handle["sizes"][index][image])
+    else:
+        # The size is not in the published layout; a centred principal point gives it, and nothing
+        # that is computed from a pinhole camera depends on it.
+        width, height = (max(1, round(2.0 * c + 1.0)) for c in centre)
+    return Camera(
+        model="PINHOLE",
+        width=width,
+        height=height,
+        params=(float(focal[0]), float(focal[-1]), centre[0] + 0.5, centre[1] + 0.5),
+        has_prior_focal_length=True,
+    )
+
+
+def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
+    points = np.asarray(handle["xs"][index], np.float32).reshape(-1, 4)
+
+    def column(group: str) -> NDArray[Any]:
+        if group not in handle or index not in handle[group]:
+            return np.zeros(len(points), np.float32)
+        values = np.asarray(handle[group][index])
+        # Some published files keep two label distances per match; the epipolar one comes first.
+        return values.reshape(len(points), -1)[:, 0] if len(points) else np.zeros(0, np.float32)
+
+    scene = handle["scenes"][index].asstr()[()] if "scenes" in handle and index in handle["scenes"] else ""
+    try:
+        return OANetPair(
+            correspondences=points,
+            label_distances=column("ys").astype(np.float32),
+            rotation=np.asarray(handle["Rs"][index], np.float64).reshape(3, 3),
+            translation=np.asarray(handle["ts"][index], np.float64).reshape(3),
+            ratios=column("ratios").astype(np.float32),
+            mutual=column("mutuals") > 0.5,
+            log_scale_ratios=column("log_scale_ratios").astype(np.float32),
+            rotations=column("rotations").astype(np.float32),
+            camera0=_camera(handle, index, 0),
+            camera1=_camera(handle, index, 1),
+            scene=scene,
+            name=f"{path.name} pair {index}",
+        )
+    except (KeyError, ValueError) as error:
+        raise InputError(f"{path}: pair {index} is damaged or incomplete ({error})") from error
+
+
+def read_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -> Iterator[OANetPair]:
+    """Read labelled pairs one by one.
+
+    Parameters
+    ----------
+    path : Path
+        File in OANet's layout.
+    max_per_scene : int, optional
+        Read only so many random pairs of each scene; a file without scene names is one scene.
+    seed : int
+        Of that choice.
+
+    Raises
+    ------
+    InputError
+        If the file or a pair cannot be read.
+    """
+    with _open(path) as handle:
+        indices = _indices(handle, path)
+        if max_per_scene is not None:
+            scenes = [
+                handle["scenes"][i].asstr()[()] if "scenes" in handle and i in handle["scenes"] else ""
+                for i in indices
+            ]
+            indices = [indices[i] for i in select_per_scene(scenes, max_per_scene, seed)]
+        for index in indices:
+            yield _read_pair(handle, index, path)
+
+
+def select_per_scene(scenes: list[str], max_per_scene: int, seed: int) -> list[int]:
+    """Indices of at most so many random entries of each scene, increasing.
+
+    A scene's choice depends on its own entries and the seed only, not on the other scenes.
+    """
+    chosen: list[int] = []
+    for scene in sorted(set(scenes)):
+        members = np.array([i for i, name in enumerate(scenes) if name == scene])
+        if len(members) > max_per_scene:
+            generator = np.random.default_rng([seed, *scene.encode()])
+            members = generator.choice(members, max_per_scene, replace=False)
+        chosen.extend(int(i) for i in members)
+    return sorted(chosen)
+
+
+def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
+    """Write labelled pairs in OANet's layout.
+
+    Parameters
+    ----------
+    path : Path
+        Replaced when all pairs are written.
+    pairs : iterable of OANetPair
+
+    Returns
+    -------
+    int
+        Number of pairs written.
+    """
+    count = 0
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as handle:
+        for name in (*_REQUIRED, "log_scale_ratios", "rotations", "sizes", "scenes"):
+            handle.create_group(name)
+        for count, pair in enumerate(pairs, start=1):
+            _write_pair(handle, str(count - 1), pair)
+    return count
+
+
+def _write_pair(handle: h5py.File, index: str, pair: OANetPair) -> None:
+    arrays: dict[str, Any] = {
+        "xs": pair.correspondences[None],
+        "ys": pair.label_distances[:, None].astype(np.float32),
+        "Rs": pair.rotation,
+        "ts": pair.translation[:, None],
+        "ratios": pair.ratios,
+        "mutuals": pair.mutual.astype(np.float32),
+        "log_scale_ratios": pair.log_scale_ratios,
+        "rotations": pair.rotations,
+        "sizes": np.array([[c.width, c.height] for c in (pair.camera0, pair.camera1)], np.int32),
+    }
+    for number, camera in ((1, pair.camera0), (2, pair.camera1)):
+        if camera.model != "PINHOLE":
+            raise ValueError(f"{pair.name}: OANet's layout holds PINHOLE cameras, got {camera.model}")
+        fx, fy, cx, cy = camera.params
+        arrays |= {
+            f"cx{number}s": np.float64(cx - 0.5),
+            f"cy{number}s": np.float64(cy - 0.5),
+            f"f{number}s": np.array([fx, fy]),
+        }
+    for name, values in arrays.items():
+        handle[name].create_dataset(index, data=values)
+    handle["scenes"].create_dataset(index, data=pair.scene, dtype=h5py.string_dtype())
