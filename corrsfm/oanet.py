@@ -28,7 +28,14 @@ from corrsfm.errors import InputError
 from corrsfm.types import Camera, Correspondences
 from corrsfm.workspace import atomic_path
 
-__all__ = ["OANetPair", "count_pairs", "read_pairs", "select_per_scene", "write_pairs"]
+__all__ = [
+    "OANetPair",
+    "count_pairs",
+    "pinhole_parameters",
+    "read_pairs",
+    "select_per_scene",
+    "write_pairs",
+]
 
 _REQUIRED = ("xs", "ys", "Rs", "ts", "ratios", "mutuals", "cx1s", "cy1s", "cx2s", "cy2s", "f1s", "f2s")
 
@@ -57,7 +64,8 @@ class OANetPair:
     rotations : (N,) float32
         Keypoint orientation in image 1 minus image 0, radians; zeros if unknown.
     camera0, camera1 : Camera
-        ``PINHOLE`` cameras, pixels in COLMAP's convention.
+        Cameras of any model; their focal lengths and principal point made the normalised coordinates, their
+        distortion, if they have one, is still in them.
     scene : str
         Name of the place, "" if unknown.
     name : str
@@ -120,8 +128,16 @@ class OANetPair:
         )
 
 
+def pinhole_parameters(camera: Camera) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point ``fx fy cx cy`` in pixels: a camera without its distortion."""
+    params = camera.params
+    if camera.model.startswith(("SIMPLE_", "RADIAL")):
+        return params[0], params[0], params[1], params[2]
+    return params[0], params[1], params[2], params[3]
+
+
 def _to_pixels(camera: Camera, normalised: NDArray[np.float32]) -> NDArray[np.float32]:
-    fx, fy, cx, cy = camera.params
+    fx, fy, cx, cy = pinhole_parameters(camera)
     return (normalised * np.array([fx, fy]) + np.array([cx, cy])).astype(np.float32)
 
 
@@ -251,7 +267,7 @@ def select_per_scene(scenes: list[str], max_per_scene: int, seed: int) -> list[i
 
 
 def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
-    """Write labelled pairs in OANet's layout.
+    """Write labelled pairs in OANet's layout, which has no place for a camera's distortion.
 
     Parameters
     ----------
@@ -286,9 +302,7 @@ def _write_pair(handle: h5py.File, index: str, pair: OANetPair) -> None:
         "sizes": np.array([[c.width, c.height] for c in (pair.camera0, pair.camera1)], np.int32),
     }
     for number, camera in ((1, pair.camera0), (2, pair.camera1)):
-        if camera.model != "PINHOLE":
-            raise ValueError(f"{pair.name}: OANet's layout holds PINHOLE cameras, got {camera.model}")
-        fx, fy, cx, cy = camera.params
+        fx, fy, cx, cy = pinhole_parameters(camera)
         arrays |= {
             f"cx{number}s": np.float64(cx - 0.5),
             f"cy{number}s": np.float64(cy - 0.5),

@@ -9,7 +9,15 @@ from two_view_pairs import make_pair
 
 from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, symmetric_epipolar_distance_sq
-from corrsfm.oanet import OANetPair, count_pairs, read_pairs, select_per_scene, write_pairs
+from corrsfm.oanet import (
+    OANetPair,
+    count_pairs,
+    pinhole_parameters,
+    read_pairs,
+    select_per_scene,
+    write_pairs,
+)
+from corrsfm.types import Camera
 
 ARRAYS = (
     "correspondences",
@@ -116,6 +124,21 @@ def test_a_damaged_pair_is_named(tmp_path: Path):
         del handle["Rs"]["7"]
     with pytest.raises(InputError, match=r"yfcc\.h5: pair 7 is damaged"):
         list(read_pairs(tmp_path / "yfcc.h5"))
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)),
+        ("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.1)),
+        ("RADIAL", (500.0, 320.0, 240.0, 0.1, 0.0)),
+        ("PINHOLE", (500.0, 500.0, 320.0, 240.0)),
+        ("OPENCV", (500.0, 500.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_pinhole_part_of_every_camera_model(model: str, params: tuple[float, ...]):
+    camera = Camera(model=model, width=640, height=480, params=params)
+    assert pinhole_parameters(camera) == (500.0, 500.0, 320.0, 240.0)
 
 
 def test_wrong_shapes_are_refused_at_construction():
