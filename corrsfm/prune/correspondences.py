@@ -40,6 +40,7 @@ def make_correspondences(
     Correspondences
         In the order of ``matches``.
     """
+    # Here, not above: it loads OpenCV, and training and the command line import this module.
     from corrsfm.images import normalise_points
 
     index0, index1 = matches.indices[:, 0], matches.indices[:, 1]
@@ -85,7 +86,7 @@ def side_information(correspondences: Correspondences, num_channels: int) -> NDA
     """
     if num_channels not in SIDE_CHANNELS:
         raise ValueError(f"no layout of {num_channels} side channels, there are {sorted(SIDE_CHANNELS)}")
-    # What is not finite says nothing about the match: the least favourable ratio, no change of scale or angle.
+    # What is not finite says nothing about the match: the worst ratio, no change of scale or angle.
     ratios = np.clip(np.nan_to_num(correspondences.ratios, nan=1.0, posinf=1.0), 0.0, 1.0)
     log_scale_ratios = np.nan_to_num(correspondences.log_scale_ratios, nan=0.0)
     rotations = np.nan_to_num(correspondences.rotations, nan=0.0, posinf=0.0, neginf=0.0)
@@ -96,4 +97,4 @@ def side_information(correspondences: Correspondences, num_channels: int) -> NDA
         np.cos(rotations),
         np.sin(rotations),
     ]
-    return np.stack(channels, axis=1).astype(np.float32)[:, :num_channels]
+    return np.ascontiguousarray(np.stack(channels, axis=1)[:, :num_channels], np.float32)

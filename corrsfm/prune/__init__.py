@@ -1,0 +1,111 @@
+"""Matches → pruned matches: every prune method behind one interface, numpy in and numpy out.
+
+::
+
+    prune/
+    ├── __init__.py          the interface and `build_pruner`; imports nothing heavy
+    ├── correspondences.py   putative matches as methods see them, shared with training
+    ├── robust.py            LO-RANSAC, MAGSAC++ and the comparison of two-view models
+    ├── classical.py         none, ratio, loransac, magsac
+    ├── learned.py           corradaptor: owns device, batches and memory
+    └── cascade.py           classical where it is beyond doubt, the network elsewhere
+
+Modules of this folder import each other downwards in the order robust < classical < learned < cascade.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
+
+from corrsfm.config import PruneConfig, PruneMethod
+from corrsfm.prune.correspondences import make_correspondences, side_information
+from corrsfm.types import Correspondences, PruneResult
+
+if TYPE_CHECKING:
+    from corrsfm.prune.learned import Pruner
+
+__all__ = ["Pruner", "PrunerProtocol", "build_pruner", "make_correspondences", "side_information"]
+
+
+class PrunerProtocol(Protocol):
+    """What every prune method offers.
+
+    Attributes
+    ----------
+    name : str
+        The method.
+    fingerprint : str
+        Everything that the results depend on besides the input: options, seed, checkpoint. Equal
+        fingerprints mean that finished work may be kept.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def fingerprint(self) -> str: ...
+
+    def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
+        """Prune pairs of any sizes.
+
+        Parameters
+        ----------
+        pairs : sequence of Correspondences
+            Empty pairs and coordinates that are not finite are allowed.
+
+        Returns
+        -------
+        list of PruneResult
+            One for each pair, in order; within it the order of the putative matches is kept. A pair's
+            result does not depend on the other pairs.
+        """
+        ...
+
+
+def build_pruner(
+    config: PruneConfig, *, device: str = "auto", seed: int = 0, threads: int = 0
+) -> PrunerProtocol:
+    """The prune method that a config asks for.
+
+    Parameters
+    ----------
+    config : PruneConfig
+    device : str
+        Device of the network: auto, cpu, cuda or cuda:N.
+    seed : int
+        Seed of the robust estimators.
+    threads : int
+        Threads of the robust estimators; 0 for all cores.
+
+    Returns
+    -------
+    PrunerProtocol
+
+    Raises
+    ------
+    CheckpointError
+        If a network is needed and its checkpoint cannot be used.
+    """
+    from corrsfm.prune.classical import EstimatorPruner, KeepAll, RatioPruner
+
+    if config.method is PruneMethod.NONE:
+        return KeepAll()
+    if config.method is PruneMethod.RATIO:
+        return RatioPruner(config.max_ratio)
+    return EstimatorPruner(
+        str(config.method),
+        max_ratio=config.max_ratio,
+        max_error_px=config.max_error_px,
+        seed=seed,
+        threads=threads,
+    )
+
+
+def __getattr__(name: str) -> Any:
+    """`Pruner`, imported on first use because torch takes seconds to load."""
+    if name == "Pruner":
+        from corrsfm.prune.learned import Pruner
+
+        return Pruner
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
