@@ -1,0 +1,170 @@
+"""Descriptors of two photos → putative matches: nearest neighbours by blocked matrix products.
+
+Descriptors are bytes, so all products and sums that make a squared distance are integers. With D ≤ 128 they
+stay below 2²⁴ and float32 holds them exactly: the result does not depend on block size, number of threads or
+device, and equal distances are really equal. (bfloat16 and float16 could hold the bytes, but not the sums.)
+Among equal distances the lowest keypoint index wins.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from corrsfm.types import Matches
+
+__all__ = ["Matcher", "match_features"]
+
+# Rows compared at a time on a CPU: the block then stays in the cache between its reductions.
+CPU_BLOCK_ROWS = 256
+MAX_EXACT_FLOAT32_SIZE = 128
+
+
+def match_features(
+    descriptors0: NDArray[np.uint8],
+    descriptors1: NDArray[np.uint8],
+    *,
+    block_size: int = 4096,
+    device: str = "cpu",
+) -> Matches:
+    """Nearest neighbour in image 1 of every keypoint of image 0.
+
+    Parameters
+    ----------
+    descriptors0 : (N0, D) uint8
+    descriptors1 : (N1, D) uint8
+    block_size : int
+        Descriptors of either image compared at a time; the memory is proportional to its square.
+    device : str
+        A torch device.
+
+    Returns
+    -------
+    Matches
+        N0 matches, or none if image 1 has no keypoint. The ratio of distances is 1 where image 1 has a single
+        keypoint or both distances are zero.
+    """
+    target = torch.device(device)
+    return _match(_Prepared(descriptors0, target), _Prepared(descriptors1, target), block_size)
+
+
+class Matcher:
+    """Matches pairs of a scene, keeping recently used descriptors on the device.
+
+    Parameters
+    ----------
+    load : callable
+        Image name → (N, D) uint8 descriptors.
+    device : str
+        A torch device.
+    block_size : int
+        See `match_features`.
+    max_cached_images : int
+        Images whose descriptors stay on the device; the least recently used one goes first. One image of
+        4096 keypoints takes 2 MB.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[str], NDArray[np.uint8]],
+        *,
+        device: str = "cpu",
+        block_size: int = 4096,
+        max_cached_images: int = 256,
+    ) -> None:
+        self._load = load
+        self._device = torch.device(device)
+        self._block_size = block_size
+        self._max_cached = max(2, max_cached_images)
+        self._cache: OrderedDict[str, _Prepared] = OrderedDict()
+
+    def match(self, name0: str, name1: str) -> Matches:
+        """Putative matches of a pair of images; the same as `match_features` on their descriptors."""
+        return _match(self._prepared(name0), self._prepared(name1), self._block_size)
+
+    def _prepared(self, name: str) -> _Prepared:
+        if name not in self._cache:
+            self._cache[name] = _Prepared(self._load(name), self._device)
+            if len(self._cache) > self._max_cached:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(name)
+        return self._cache[name]
+
+
+class _Prepared:
+    """Descriptors of one image on the device."""
+
+    def __init__(self, descriptors: NDArray[np.uint8], device: torch.device) -> None:
+        exact = descriptors.shape[1] <= MAX_EXACT_FLOAT32_SIZE
+        values = torch.from_numpy(np.ascontiguousarray(descriptors)).to(device)
+        self.values = values.to(torch.float32 if exact else torch.float64)  # (N, D)
+        self.squared = self.values.square().sum(dim=1)  # (N,)
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+def _match(image0: _Prepared, image1: _Prepared, block_size: int) -> Matches:
+    num0, num1 = len(image0), len(image1)
+    if num0 == 0 or num1 == 0:
+        return Matches(
+            indices=np.zeros((0, 2), np.int32), ratios=np.zeros(0, np.float32), mutual=np.zeros(0, np.bool_)
+        )
+    device = image0.values.device
+    best = torch.full((num0,), torch.inf, dtype=image0.squared.dtype, device=device)
+    second = best.clone()
+    index = torch.zeros(num0, dtype=torch.int64, device=device)
+    best_back = torch.full((num1,), torch.inf, dtype=image0.squared.dtype, device=device)
+    num_rows = min(block_size, CPU_BLOCK_ROWS) if device.type == "cpu" else block_size
+    for start1 in range(0, num1, block_size):
+        columns = slice(start1, min(start1 + block_size, num1))
+        for start0 in range(0, num0, num_rows):
+            rows = slice(start0, min(start0 + num_rows, num0))
+            distances = _squared_distances(image0, image1, rows, columns)
+            best_back[columns] = torch.minimum(best_back[columns], distances.amin(dim=0))
+            _update_two_nearest(distances, best[rows], second[rows], index[rows], start1)
+    mutual = _mutual(best, index, best_back)
+    ratios = torch.where((second > 0) & torch.isfinite(second), (best.double() / second.double()).sqrt(), 1.0)
+    return Matches(
+        indices=np.stack([np.arange(num0), index.cpu().numpy()], axis=1).astype(np.int32),
+        ratios=ratios.cpu().numpy().astype(np.float32),
+        mutual=mutual.cpu().numpy(),
+    )
+
+
+def _squared_distances(image0: _Prepared, image1: _Prepared, rows: slice, columns: slice) -> torch.Tensor:
+    """(rows, columns) squared Euclidean distances, exact."""
+    distances = torch.addmm(image1.squared[columns], image0.values[rows], image1.values[columns].T, alpha=-2)
+    return distances.add_(image0.squared[rows, None])
+
+
+def _update_two_nearest(
+    distances: torch.Tensor, best: torch.Tensor, second: torch.Tensor, index: torch.Tensor, start1: int
+) -> None:
+    """Merge a block into the running two smallest distances of its rows, in place; overwrites the block."""
+    block_index = distances.argmin(dim=1, keepdim=True)  # the first of equals, unlike min(dim=1)
+    block_best = distances.gather(1, block_index)[:, 0]
+    distances.scatter_(1, block_index, torch.inf)
+    block_second = distances.amin(dim=1)
+    # Strict: an earlier block has the lower index and keeps a tie.
+    closer = block_best < best
+    second.copy_(torch.minimum(torch.minimum(second, block_second), torch.maximum(best, block_best)))
+    index.copy_(torch.where(closer, block_index[:, 0] + start1, index))
+    best.copy_(torch.minimum(best, block_best))
+
+
+def _mutual(best: torch.Tensor, index: torch.Tensor, best_back: torch.Tensor) -> torch.Tensor:
+    """(N0,) bool: whether no keypoint of image 0 is closer to the match, or as close with a lower index.
+
+    Comparing distances spares the column indices, whose search would take longer than the products.
+    """
+    closest = best == best_back[index]
+    own = torch.arange(len(best), device=best.device)
+    claims = torch.where(closest, own, len(best))
+    first = torch.full_like(best_back, len(best), dtype=torch.int64)
+    first.scatter_reduce_(0, index, claims, "amin")
+    return closest & (first[index] == own)
