@@ -12,7 +12,7 @@ match twice, and whoever counts distinct correspondences must compare coordinate
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
@@ -167,7 +167,7 @@ def _detect_opencv(
     return _opencv_geometry(keypoints), scores, descriptors
 
 
-def _opencv_geometry(keypoints: tuple[cv2.KeyPoint, ...] | list[cv2.KeyPoint]) -> NDArray[np.float64]:
+def _opencv_geometry(keypoints: Sequence[cv2.KeyPoint]) -> NDArray[np.float64]:
     """(N, 4) x y σ orientation; OpenCV's size is the diameter 2σ, its angle runs clockwise in degrees."""
     rows = [(k.pt[0] + 0.5, k.pt[1] + 0.5, 0.5 * k.size, np.radians(k.angle)) for k in keypoints]
     return np.array(rows, np.float64).reshape(-1, 4)
