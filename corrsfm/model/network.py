@@ -140,7 +140,9 @@ def normalise(centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor |
     return torch.addcmul(shift.to(values.dtype), values, scale.to(values.dtype))
 
 
-def _follow_batch(centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+def _follow_batch(
+    centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """Mean and variance of instance-normalised features over the batch; updates the running statistics."""
     values, variance = centred
     normalised = (variance / (variance + eps)).reshape(-1, variance.shape[-1])  # (B,C)
@@ -164,7 +166,9 @@ def linear_norm(x: Tensor, linear: nn.Linear, norm: nn.BatchNorm1d, mask: Tensor
     """Linear layer, then batch normalisation over all rows; at inference folded into one linear layer."""
     if not norm.training:
         gain = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-        return F.linear(x, linear.weight * gain[:, None], (linear.bias - norm.running_mean) * gain + norm.bias)
+        return F.linear(
+            x, linear.weight * gain[:, None], (linear.bias - norm.running_mean) * gain + norm.bias
+        )
     x = linear(x)
     if mask is None:
         return norm(x.flatten(0, -2)).view(x.shape)
@@ -417,7 +421,13 @@ class Attention(nn.Module):
         return self.output(out.transpose(1, 2).flatten(2))
 
     def _flow(
-        self, q: Tensor, k: Tensor, context: Tensor, value_weight: Tensor, value_bias: Tensor, mask: Tensor | None
+        self,
+        q: Tensor,
+        k: Tensor,
+        context: Tensor,
+        value_weight: Tensor,
+        value_bias: Tensor,
+        mask: Tensor | None,
     ) -> Tensor:
         """Flow attention: linear in N, with competition among sources and allocation to sinks.
 
@@ -440,7 +450,9 @@ class Attention(nn.Module):
         weighted = (k.unflatten(-1, (heads, -1)) * competition[..., None].to(k.dtype)).flatten(2)  # (B,N,C)
         summed = (weighted.mT @ context).unflatten(1, (heads, -1))  # (B,H,D,C)
         mass = weighted.sum(1).unflatten(-1, (heads, -1))[..., None]  # (B,H,D,1)
-        flow = summed @ value_weight.unflatten(0, (heads, -1)).mT + mass * value_bias.view(heads, 1, -1)  # (B,H,D,D)
+        flow = summed @ value_weight.unflatten(0, (heads, -1)).mT + mass * value_bias.view(
+            heads, 1, -1
+        )  # (B,H,D,D)
         flow = flow @ self.output.weight.mT.unflatten(0, (heads, -1))  # (B,H,D,C)
         gated = (q.unflatten(-1, (heads, -1)) * (incoming * allocation)[..., None].to(q.dtype)).flatten(2)
         return gated @ flow.flatten(1, 2) + self.output.bias
@@ -594,7 +606,8 @@ class FusionRound(nn.Module):
         self.explicit = ExplicitBranch(channels, num_neighbors) if branches != "implicit" else None
         self.implicit = ImplicitBranch(channels, clusters, oa_filters) if branches != "explicit" else None
         self.injection = nn.ModuleList(
-            MotionInjectionLayer(channels, heads, mlp_ratio, attention, motion) for _ in range(2 * motion_stacking)
+            MotionInjectionLayer(channels, heads, mlp_ratio, attention, motion)
+            for _ in range(2 * motion_stacking)
         )
         self.logit = nn.Linear(channels, 1)
 
@@ -614,7 +627,9 @@ class FusionRound(nn.Module):
 class PruningBlock(nn.Module):
     """Stem, motion embedding and fusion rounds on one set of correspondences."""
 
-    def __init__(self, *, input_channels: int, fusion_rounds: int, channels: int, motion: bool, **fusion) -> None:  # type: ignore[no-untyped-def]
+    def __init__(
+        self, *, input_channels: int, fusion_rounds: int, channels: int, motion: bool, **fusion
+    ) -> None:  # type: ignore[no-untyped-def]
         super().__init__()
         self.stem = nn.Linear(input_channels, channels)
         self.stem_norm = nn.BatchNorm1d(channels)
@@ -648,6 +663,9 @@ class WeightHead(nn.Module):
         self.linear2 = nn.Linear(channels, channels)
         self.norm2 = nn.BatchNorm1d(channels)
         self.output = nn.Linear(channels, 2)
+        # The published unit has this projection beside its shortcut and adds the input instead. It is here because
+        # the published parameter counts include it; frozen, because no gradient ever reaches it.
+        self.shortcut = nn.Linear(channels, channels).requires_grad_(False)
 
     def forward(self, features: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
         """Features (B,N,C) to logits (B,N) and weights (B,N) that sum to almost one."""
@@ -671,7 +689,9 @@ class PruningOutput(NamedTuple):
     """
 
     logits: tuple[Tensor, ...]  # (B,N), ..., (B,N'), ..., (B,N'')
-    indices: tuple[Tensor, ...]  # int64, like logits: which input each logit belongs to, best first after a pruning
+    indices: tuple[
+        Tensor, ...
+    ]  # int64, like logits: which input each logit belongs to, best first after a pruning
     essential: Tensor  # (B,3,3), unit norm, x1^T E x0 = 0; the fundamental matrix with estimate="fundamental"
     residuals: Tensor  # (B,N), squared symmetric epipolar distance of every input to `essential`
 
@@ -712,12 +732,21 @@ class NetworkConfig:
     def __post_init__(self) -> None:
         problems = []
         if self.channels < 4 or self.channels % 4 or self.channels % self.heads:
-            problems.append(f"channels is {self.channels}, expected a multiple of 4 and of heads ({self.heads})")
-        if self.branches != "implicit" and (len(self.neighbors) != 2 or any(k < 3 or k % 3 for k in self.neighbors)):
+            problems.append(
+                f"channels is {self.channels}, expected a multiple of 4 and of heads ({self.heads})"
+            )
+        if self.branches != "implicit" and (
+            len(self.neighbors) != 2 or any(k < 3 or k % 3 for k in self.neighbors)
+        ):
             problems.append(f"neighbors is {self.neighbors}, expected two multiples of 3")
         if not 0 < self.pruning_ratio <= 1:
             problems.append(f"pruning_ratio is {self.pruning_ratio}, expected more than 0 and at most 1")
-        for name, smallest in [("clusters", 1), ("fusion_rounds", 1), ("motion_stacking", 0), ("side_channels", 0)]:
+        for name, smallest in [
+            ("clusters", 1),
+            ("fusion_rounds", 1),
+            ("motion_stacking", 0),
+            ("side_channels", 0),
+        ]:
             if getattr(self, name) < smallest:
                 problems.append(f"{name} is {getattr(self, name)}, expected at least {smallest}")
         for name, valid in [
@@ -844,11 +873,16 @@ class CorrAdaptor(nn.Module):
         usable = (correspondences.abs() <= LARGEST_COORDINATE).all(-1) & side.isfinite().all(-1)
         if mask is not None or not usable.all():
             mask = usable if mask is None else usable & mask
-        missing = math.ceil(max(self.min_rows[0], self.min_rows[1] / self.pruning_ratio, 1 / self.pruning_ratio**2))
+        missing = math.ceil(
+            max(self.min_rows[0], self.min_rows[1] / self.pruning_ratio, 1 / self.pruning_ratio**2)
+        )
         missing = max(missing - num_rows, 0)
         if missing:
             mask = F.pad(usable if mask is None else mask, (0, missing))
-            correspondences, side = F.pad(correspondences, (0, 0, 0, missing)), F.pad(side, (0, 0, 0, missing))
+            correspondences, side = (
+                F.pad(correspondences, (0, 0, 0, missing)),
+                F.pad(side, (0, 0, 0, missing)),
+            )
         if mask is not None:
             correspondences = torch.where(mask[..., None], correspondences, 0.0)
             side = torch.where(mask[..., None], side, 0.0)

@@ -1,0 +1,317 @@
+"""Checkpoints of the network: load, save, verify.
+
+A checkpoint is one file that `torch.load` reads with ``weights_only=True``::
+
+    {"format": "corrsfm-network-1",
+     "config": {...},         the fields of `NetworkConfig`
+     "state_dict": {...},     parameters and running statistics, in float32 or half precision
+     "provenance": {...}}     plain values: data, licence, steps, seed, scores, ...
+
+The published format (the authors' training code: a ``state_dict`` key, names perhaps behind ``module.``) loads as well.
+Bundled checkpoints lie beside this file and are listed in `REGISTRY`; their hash is checked at every loading.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import pickle
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.model.network import CorrAdaptor, NetworkConfig
+
+__all__ = [
+    "DEFAULT_CHECKPOINT",
+    "FORMAT",
+    "REGISTRY",
+    "BundledCheckpoint",
+    "from_published",
+    "load_network",
+    "read_provenance",
+    "save_network",
+]
+
+FORMAT = "corrsfm-network-1"
+
+CHECKPOINT_DIR = Path(__file__).parent / "checkpoints"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BundledCheckpoint:
+    """What is known about a checkpoint that comes with the package; its model card says more."""
+
+    name: str
+    """How users refer to it."""
+    file: str
+    """File name below ``corrsfm/model/checkpoints``."""
+    sha256: str
+    """Hash of the file."""
+    config: NetworkConfig
+    """Architecture."""
+    licence: str
+    """Licence of the weights."""
+    training_data: str
+    """What it was trained on."""
+    score: str
+    """Measured result, with the data it was measured on."""
+
+
+REGISTRY: dict[str, BundledCheckpoint] = {}
+"""Bundled checkpoints by name."""
+
+DEFAULT_CHECKPOINT: str | None = None
+"""Name of the one that is loaded when none is asked for."""
+
+
+def load_network(path: Path | str | None = None, *, map_location: str | torch.device = "cpu") -> CorrAdaptor:
+    """Network with the weights of a checkpoint, in evaluation mode, float32.
+
+    Parameters
+    ----------
+    path : path or str, optional
+        A checkpoint of either format, or the name of a bundled one. The default bundled one if not given.
+    map_location : str or torch.device
+        Where its parameters are put.
+
+    Raises
+    ------
+    CheckpointError
+        If the file is missing, damaged, of another format or of another network; missing and unexpected keys are
+        listed. If nothing is bundled, or a bundled file is not the one that was released.
+    """
+    bundled = _find_bundled(path)
+    file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
+    content = _read(file, map_location, expected_sha256=bundled.sha256 if bundled else None)
+    if content.get("format") == FORMAT:
+        config, state = _read_config(content.get("config"), file), content.get("state_dict")
+    elif "format" in content:
+        raise CheckpointError(
+            f"{file}: format {content['format']!r}, expected {FORMAT!r}; try a newer corrsfm"
+        )
+    else:
+        config, state = NetworkConfig(), content.get("state_dict")
+        if isinstance(state, Mapping):
+            state = from_published(state)
+    if not isinstance(state, Mapping):
+        raise CheckpointError(
+            f"{file}: holds no 'state_dict'; expected a checkpoint of corrsfm or the published code"
+        )
+    network = CorrAdaptor.from_config(config).to(map_location)
+    _fill(network, state, file)
+    return network.eval()
+
+
+def save_network(
+    network: CorrAdaptor, path: Path | str, *, provenance: Mapping[str, Any] | None = None, half: bool = False
+) -> str:
+    """Write a checkpoint.
+
+    Parameters
+    ----------
+    network : CorrAdaptor
+        Built by `CorrAdaptor.from_config`.
+    path : path or str
+        Replaced in one step if it exists.
+    provenance : mapping of plain values, optional
+        Where the weights come from.
+    half : bool
+        Store weights in half precision, half the size; running statistics stay in single precision.
+
+    Returns
+    -------
+    str
+        Hex SHA-256 of the file, for the registry.
+    """
+    if network.config is None:
+        raise CheckpointError(
+            f"{path}: the network has no configuration; build it with CorrAdaptor.from_config"
+        )
+    state = {}
+    for name, value in network.state_dict().items():
+        value = value.detach().cpu()
+        if half and value.is_floating_point() and "running_" not in name:
+            value = value.half()
+        state[name] = value.contiguous()
+    content = {
+        "format": FORMAT,
+        "config": dataclasses.asdict(network.config),
+        "state_dict": state,
+        "provenance": dict(provenance or {}),
+    }
+    path = Path(path)
+    unfinished = path.with_name(path.name + ".tmp")
+    torch.save(content, unfinished)
+    unfinished.replace(path)
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_provenance(path: Path | str | None = None) -> dict[str, Any]:
+    """Where the weights of a corrsfm checkpoint come from; empty for one in the published format."""
+    bundled = _find_bundled(path)
+    file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
+    return dict(_read(file, "cpu", expected_sha256=bundled.sha256 if bundled else None).get("provenance", {}))
+
+
+def _find_bundled(path: Path | str | None) -> BundledCheckpoint | None:
+    if path is None:
+        if DEFAULT_CHECKPOINT is None:
+            raise CheckpointError(
+                "no network checkpoint comes with this version of corrsfm; "
+                "give one with --model, or choose a --method that needs none, such as 'loransac'"
+            )
+        return REGISTRY[DEFAULT_CHECKPOINT]
+    return REGISTRY.get(str(path))
+
+
+def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str | None) -> dict[str, Any]:
+    """The dictionary in a checkpoint file."""
+    if not file.is_file():
+        names = ", ".join(REGISTRY) or "none"
+        raise CheckpointError(
+            f"{file}: no such checkpoint; expected a file or the name of a bundled one ({names})"
+        )
+    if expected_sha256 is not None:
+        found = hashlib.sha256(file.read_bytes()).hexdigest()
+        if found != expected_sha256:
+            raise CheckpointError(
+                f"{file}: SHA-256 is {found}, expected {expected_sha256}; the file is damaged: reinstall corrsfm"
+            )
+    try:
+        content = torch.load(file, map_location=map_location, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CheckpointError(f"{file}: not a checkpoint that can be read safely ({reason})") from error
+    if not isinstance(content, dict):
+        raise CheckpointError(
+            f"{file}: holds a {type(content).__name__}, expected a dictionary with a 'state_dict'"
+        )
+    return content
+
+
+def _read_config(values: Any, file: Path) -> NetworkConfig:
+    if not isinstance(values, dict):
+        raise CheckpointError(f"{file}: holds no network configuration")
+    known = [field.name for field in dataclasses.fields(NetworkConfig)]
+    unknown = [str(name) for name in values if name not in known]
+    if unknown:
+        raise CheckpointError(
+            f"{file}: unknown network options {', '.join(unknown)}; valid are {', '.join(known)}"
+        )
+    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    try:
+        return NetworkConfig(**values)
+    except (ConfigError, TypeError) as error:
+        raise CheckpointError(f"{file}: {error}") from error
+
+
+def _fill(network: CorrAdaptor, state: Mapping[str, Any], file: Path) -> None:
+    """Copy a state dict into a network of exactly its names and shapes."""
+    own = network.state_dict()
+    problems = []
+    for title, names in [("missing", own.keys() - state.keys()), ("unexpected", state.keys() - own.keys())]:
+        if names:
+            problems.append(f"{len(names)} {title} keys: {', '.join(sorted(map(str, names)))}")
+    for name in sorted(own.keys() & state.keys()):
+        shape = tuple(getattr(state[name], "shape", ()))
+        if not isinstance(state[name], Tensor):
+            problems.append(f"{name} is not a tensor")
+        elif shape != tuple(own[name].shape):
+            problems.append(f"{name} has shape {shape}, expected {tuple(own[name].shape)}")
+        elif not state[name].isfinite().all():
+            problems.append(f"{name} holds values that are not finite")
+    if problems:
+        raise CheckpointError(f"{file}: not a checkpoint of this network: " + "; ".join(problems))
+    network.load_state_dict(dict(state), strict=True)
+
+
+# Tensors of the published checkpoint that never reach its output.
+UNUSED = re.compile(r"\.(m_proj|fusion[12]|embed_1)\.")
+
+# Published name to ours, applied in this order. Sequential containers are numbered there; here layers have names.
+RENAMING = [
+    (r"^ds_1\.embed_2\.right\.0\.", "head.shortcut."),
+    (r"^ds_1\.embed_2\.left\.0\.", "head.linear1."),
+    (r"^ds_1\.embed_2\.left\.2\.", "head.norm1."),
+    (r"^ds_1\.embed_2\.left\.4\.", "head.linear2."),
+    (r"^ds_1\.embed_2\.left\.6\.", "head.norm2."),
+    (r"^ds_1\.linear_2\.", "head.output."),
+    (r"^ds_([01])\.", r"blocks.\1."),
+    (r"\.conv\.0\.(?=weight|bias)", ".stem."),
+    (r"(^blocks\.\d)\.conv\.2\.", r"\1.stem_norm."),
+    (r"\.motion_embed\.0\.", ".motion.linear1."),
+    (r"\.motion_embed\.1\.", ".motion.norm1."),
+    (r"\.motion_embed\.3\.", ".motion.linear2."),
+    (r"\.motion_embed\.4\.", ".motion.norm2."),
+    (r"\.motion_embed\.6\.", ".motion.linear3."),
+    (r"\.linear_([01])\.", r".rounds.\1.logit."),
+    (r"\.(gab|aggregator|pool|unpool|oafilter|ltr)1\.", r".rounds.0.\1."),
+    (r"\.(gab|aggregator|pool|unpool|oafilter|ltr)2\.", r".rounds.1.\1."),
+    (r"\.gab\.embed\.0\.", ".explicit.embed."),
+    (r"\.gab\.embed\.2\.", ".explicit.embed_norm."),
+    (r"\.gab\.pointcn1\.", ".explicit.neighbor_context."),
+    (r"\.gab\.pointcn2\.", ".explicit.channel_context."),
+    (r"_context\.1\.", "_context.norm1."),
+    (r"_context\.3\.", "_context.linear1."),
+    (r"_context\.5\.", "_context.norm2."),
+    (r"_context\.7\.", "_context.linear2."),
+    (r"\.gab\.(spatial|neighbor|channel)_att\.", r".explicit.\1_attention."),
+    (r"_attention\.0\.", "_attention.squeeze."),
+    (r"_attention\.1\.", "_attention.squeeze_norm."),
+    (r"_attention\.3\.", "_attention.expand."),
+    (r"_attention\.4\.", "_attention.expand_norm."),
+    (r"\.aggregator\.conv1\.0\.", ".explicit.ring."),
+    (r"\.aggregator\.conv1\.1\.", ".explicit.ring_norm."),
+    (r"\.aggregator\.conv2\.0\.", ".explicit.gather."),
+    (r"\.aggregator\.conv2\.1\.", ".explicit.gather_norm."),
+    (r"\.(pool|unpool)\.conv\.1\.", r".implicit.\1_norm."),
+    (r"\.(pool|unpool)\.conv\.3\.", r".implicit.\1."),
+    (r"\.oafilter\.", ".implicit.filters."),
+    (r"\.conv1\.1\.", ".norm1."),
+    (r"\.conv1\.3\.", ".linear1."),
+    (r"\.conv2\.0\.", ".cluster_norm."),
+    (r"\.conv2\.2\.", ".cluster_linear."),
+    (r"\.conv3\.2\.", ".norm2."),
+    (r"\.conv3\.4\.", ".linear2."),
+    (r"\.ltr\.layers\.", ".injection."),
+    (r"\.self_attn\.", ".self_attention."),
+    (r"\.cross_attn\.", ".motion_attention."),
+    (r"\.q_proj\.", ".query."),
+    (r"\.k_proj\.", ".key."),
+    (r"\.v_proj\.", ".value."),
+    (r"_attention\.proj\.", "_attention.output."),
+    (r"\.norm1_1\.", ".query_norm."),
+    (r"\.norm1_2\.", ".context_norm."),
+    (r"\.norm1_3\.", ".motion_norm."),
+    (r"(\.injection\.\d+)\.norm2\.", r"\1.stream_norm."),
+    (r"(\.injection\.\d+)\.norm3\.", r"\1.mlp_norm."),
+    (r"\.mlp\.fc1\.", ".expand."),
+    (r"\.mlp\.fc2\.", ".contract."),
+    (r"\.gamma$", ".layer_scale"),
+]
+
+
+def from_published(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """State dict of the published code as one of `CorrAdaptor`.
+
+    Names that are not recognised are kept, so that loading can list them as unexpected.
+    """
+    result = {}
+    for published, value in state.items():
+        name = str(published).removeprefix("module.")
+        if UNUSED.search(name):
+            continue
+        for pattern, replacement in RENAMING:
+            name = re.sub(pattern, replacement, name)
+        if isinstance(value, Tensor) and value.ndim == 4:
+            # Convolution (out, in, 1, width) to linear layer (out, width * in): our rows hold one neighbour after another.
+            value = value.squeeze(2).transpose(1, 2).flatten(1)
+        result[name] = value
+    return result
