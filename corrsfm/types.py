@@ -29,10 +29,13 @@ __all__ = [
     "Features",
     "ImageRecord",
     "Matches",
+    "ModelSummary",
     "Pair",
     "PairList",
+    "PairStatistics",
     "PruneResult",
     "TwoViewModel",
+    "VerifiedPair",
 ]
 
 Pair = tuple[str, str]
@@ -294,3 +297,79 @@ class PruneResult:
 
     def __len__(self) -> int:
         return len(self.scores)
+
+
+@dataclass(frozen=True, kw_only=True)
+class VerifiedPair:
+    """What a database says about a pair.
+
+    Attributes
+    ----------
+    name0, name1 : str
+        ``name0 < name1``.
+    num_matches : int
+        Matches that were verified; 0 for a pair pruned to nothing.
+    num_inliers : int
+        Matches that agree with the two-view geometry.
+    configuration : str
+        COLMAP's name for the kind of geometry, ``UNDEFINED`` if there is none.
+    """
+
+    name0: str
+    name1: str
+    num_matches: int
+    num_inliers: int
+    configuration: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairStatistics:
+    """How many matches of a pair survived each step.
+
+    Attributes
+    ----------
+    name0, name1 : str
+    num_putative : int
+        Matches of the descriptors.
+    num_pruned : int
+        Matches that pruning kept.
+    num_verified : int
+        Kept matches that agree with the verified two-view geometry.
+    """
+
+    name0: str
+    name1: str
+    num_putative: int
+    num_pruned: int
+    num_verified: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSummary:
+    """A reconstructed model in numbers.
+
+    Attributes
+    ----------
+    image_names : tuple of str
+        Registered photos, sorted.
+    num_points, num_observations : int
+    mean_track_length : float
+        Observations per point.
+    mean_observations_per_image : float
+    mean_error_px, median_error_px, p95_error_px : float
+        Reprojection error over all observations, in pixels; NaN for a model without points.
+    """
+
+    image_names: tuple[str, ...]
+    num_points: int
+    num_observations: int
+    mean_track_length: float
+    mean_observations_per_image: float
+    mean_error_px: float
+    median_error_px: float
+    p95_error_px: float
+
+    @property
+    def num_images(self) -> int:
+        """Number of registered photos."""
+        return len(self.image_names)

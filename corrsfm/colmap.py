@@ -1,0 +1,136 @@
+"""How corrsfm talks to pycolmap: a log that does not reach the terminal, and failures in plain words.
+
+pycolmap's log is one per process (glog), so `colmap_log` is not for use from several threads at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
+import pycolmap
+
+from corrsfm.errors import DatabaseError
+
+__all__ = ["colmap_log", "database_errors", "is_sqlite"]
+
+_SILENT = 3
+_SMALLEST_DISK_BYTES = 1 << 20
+
+
+@contextlib.contextmanager
+def colmap_log(log_file: Path | None = None) -> Iterator[None]:
+    """Keep pycolmap quiet; collect what it has to say in a file.
+
+    Parameters
+    ----------
+    log_file : Path, optional
+        The messages are appended to it when the block ends, also when it fails. Without it they are dropped;
+        pycolmap's own default would be the terminal and files in the temporary folder of the machine.
+    """
+    log = pycolmap.logging
+    before = (log.minloglevel, log.alsologtostderr, log.logtostderr)
+    log.alsologtostderr = log.logtostderr = False
+    log.minloglevel = _SILENT if log_file is None else 0
+    try:
+        if log_file is None:
+            yield
+        else:
+            with tempfile.TemporaryDirectory(prefix="corrsfm-log-") as folder:
+                # One file for all levels: messages of a level go to the files of all lower levels, too.
+                log.set_log_destination(log.INFO, str(Path(folder) / "colmap."))
+                for level in (log.WARNING, log.ERROR, log.FATAL):
+                    log.set_log_destination(level, "")
+                try:
+                    yield
+                finally:
+                    # Closing the destination flushes it.
+                    log.set_log_destination(log.INFO, "")
+                    _append(sorted(Path(folder).iterdir()), log_file)
+    finally:
+        log.minloglevel, log.alsologtostderr, log.logtostderr = before
+
+
+def _append(sources: list[Path], target: Path) -> None:
+    # glog also leaves a link named after the program beside its file.
+    texts = [source.read_bytes() for source in sources if source.is_file() and not source.is_symlink()]
+    # A log that cannot be written, on a full disk say, must not hide the error that is being logged.
+    with contextlib.suppress(OSError), open(target, "ab") as file:
+        file.write(b"".join(texts))
+
+
+@contextlib.contextmanager
+def database_errors(path: Path) -> Iterator[None]:
+    """Translate what pycolmap says about a database into a `DatabaseError` with what to try.
+
+    Parameters
+    ----------
+    path : Path
+        The database that the block works on, for the message.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        explanation = _explain(path, str(error))
+        if explanation is None:
+            raise
+        raise DatabaseError(f"{path}: {explanation}") from error
+
+
+def _explain(path: Path, message: str) -> str | None:
+    """Cause and remedy of a message of pycolmap's database; None if it is about something else."""
+    if "disk is full" in message:
+        return "the disk is full; free some space and run the same command again"
+    if "database is locked" in message:
+        return _HELD
+    if "readonly database" in message:
+        return "cannot be written; check the permissions of the file and its folder"
+    if "No registered database factory" in message:
+        return _explain_unopened(path)
+    if "SQLite error" in message:
+        return f"{message.rpartition('SQLite error: ')[2]}; delete the file and make it again"
+    return None
+
+
+_HELD = "is in use by another program; close it there (COLMAP, another corrsfm) and try again"
+
+
+def _explain_unopened(path: Path) -> str:
+    if not path.parent.is_dir():
+        return "its folder does not exist"
+    if path.is_dir():
+        return "is a folder, expected a COLMAP database"
+    if path.exists() and path.stat().st_size:
+        try:
+            is_database = is_sqlite(path)
+        except OSError as error:
+            return f"cannot be read ({error.strerror})"
+        if not is_database:
+            return "is not a COLMAP database; move it away and make it again"
+    if shutil.disk_usage(path.parent).free < _SMALLEST_DISK_BYTES:
+        return "the disk is full; free some space and run the same command again"
+    if _is_locked(path):
+        return _HELD
+    return "cannot be opened; check the permissions of the file and its folder, or delete it to make it anew"
+
+
+def is_sqlite(path: Path) -> bool:
+    """Whether a file begins like an SQLite database."""
+    with open(path, "rb") as file:
+        return file.read(16) == b"SQLite format 3\0"
+
+
+def _is_locked(path: Path) -> bool:
+    """Whether another process holds a lock; only asked once pycolmap has given up on the file."""
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True, timeout=0)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.rollback()
+    except sqlite3.OperationalError as error:
+        return "locked" in str(error)
+    return False

@@ -1,0 +1,364 @@
+"""Features and pruned matches → a COLMAP database with verified two-view geometries.
+
+Everything goes through pycolmap's API, so the schema is always the one that pycolmap expects. Verification
+is `pycolmap.geometric_verification`, which estimates geometries from the matches that are there; its
+neighbour `verify_matches` would match the descriptors of pruned-away pairs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.colmap import colmap_log, database_errors, is_sqlite
+from corrsfm.config import DatabaseConfig
+from corrsfm.errors import DatabaseError, InputError
+from corrsfm.types import Camera, Features, ImageRecord, Pair, VerifiedPair
+from corrsfm.workspace import atomic_path
+
+__all__ = ["DatabaseSummary", "read_verified_pairs", "verify_database", "write_database"]
+
+# Ctrl-C is obeyed between batches of pairs.
+_PAIRS_PER_BATCH = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatabaseSummary:
+    """What a database holds.
+
+    Attributes
+    ----------
+    num_images, num_keypoints : int
+    num_pairs : int
+        Pairs on record, those pruned to nothing included.
+    num_empty_pairs : int
+        Pairs pruned to nothing.
+    num_matches : int
+        Matches over all pairs.
+    num_duplicates : int
+        Repeated matches that were left out.
+    num_verified_pairs, num_inliers : int
+        Pairs with a two-view geometry, and the matches that agree with it.
+    """
+
+    num_images: int
+    num_keypoints: int
+    num_pairs: int
+    num_empty_pairs: int
+    num_matches: int
+    num_duplicates: int
+    num_verified_pairs: int
+    num_inliers: int
+
+
+def write_database(
+    path: Path,
+    *,
+    images: Sequence[ImageRecord],
+    cameras: Sequence[Camera],
+    features: Callable[[str], Features],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    config: DatabaseConfig,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+) -> DatabaseSummary:
+    """Write and verify a database; it appears at ``path`` whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        An existing database there is replaced.
+    images : sequence of ImageRecord
+        Written in order of their names; positions from GPS become pose priors.
+    cameras : sequence of Camera
+        What the images' ``camera_id`` points into.
+    features : callable
+        Image name → `Features`; called once an image.
+    pruned : iterable of (str, str, (K, 2) int32)
+        Two image names and the indices of the kept matches; K may be 0, and the pair stays on record.
+    config : DatabaseConfig
+    seed : int
+        Seed of the robust estimation.
+    num_threads : int
+        Threads of the verification; 0 for all cores.
+    log_file : Path, optional
+        Where pycolmap's messages are appended.
+
+    Raises
+    ------
+    InputError
+        If a pair names an unknown photo, a photo twice or keypoints that do not exist, or occurs twice.
+    DatabaseError
+        If the database cannot be written, or the one to be replaced is in use.
+    """
+    _check_not_in_use(path)
+    with atomic_path(path) as temporary:
+        for suffix in ("-wal", "-shm"):
+            temporary.with_name(temporary.name + suffix).unlink(missing_ok=True)
+        # Only quiet here: `verify_database` keeps the log.
+        with colmap_log(), database_errors(temporary):
+            num_duplicates, num_empty = _fill(
+                temporary, images, cameras, features, pruned, config.write_descriptors
+            )
+        verify_database(
+            temporary,
+            min_num_inliers=config.min_num_inliers,
+            max_error_px=config.verification_error_px,
+            seed=seed,
+            num_threads=num_threads,
+            log_file=log_file,
+        )
+        with colmap_log(), database_errors(temporary), pycolmap.Database.open(temporary) as database:
+            # A pair whose verification failed has a row without inliers.
+            _, num_inliers = database.read_two_view_geometry_num_inliers()
+            summary = DatabaseSummary(
+                num_images=database.num_images(),
+                num_keypoints=database.num_keypoints(),
+                num_pairs=database.num_matched_image_pairs(),
+                num_empty_pairs=num_empty,
+                num_matches=database.num_matches(),
+                num_duplicates=num_duplicates,
+                num_verified_pairs=sum(num > 0 for num in num_inliers),
+                num_inliers=sum(num_inliers),
+            )
+    return summary
+
+
+def verify_database(
+    path: Path,
+    *,
+    min_num_inliers: int,
+    max_error_px: float,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+) -> None:
+    """Estimate the two-view geometry of every pair with matches, dropping earlier estimates.
+
+    Parameters
+    ----------
+    path : Path
+        An existing database; changed in place, pair by pair.
+    min_num_inliers : int
+        Fewest matches a geometry must explain.
+    max_error_px : float
+        Inlier threshold in pixels.
+    seed, num_threads, log_file
+        As for `write_database`; results do not depend on the number of threads.
+
+    Raises
+    ------
+    DatabaseError
+        If there is no such database or it is in use.
+    """
+    if not path.exists():
+        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    options = pycolmap.TwoViewGeometryOptions()
+    options.min_num_inliers = min_num_inliers
+    options.ransac.max_error = max_error_px
+    options.ransac.random_seed = seed
+    with colmap_log(log_file), database_errors(path):
+        with pycolmap.Database.open(path) as database:
+            database.clear_two_view_geometries()
+        pycolmap.geometric_verification(
+            path,
+            pycolmap.GeometricVerifierOptions(num_threads=num_threads or -1),
+            pycolmap.ExistingMatchedPairingOptions(batch_size=_PAIRS_PER_BATCH),
+            options,
+        )
+
+
+def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[VerifiedPair]:
+    """Counts of every pair in a database, sorted by names.
+
+    Parameters
+    ----------
+    path : Path
+    pairs : iterable of Pair
+        Further pairs to look up. COLMAP's tables do not list pairs without matches; those of ``pairs`` that
+        are on record as pruned to nothing are returned with zero matches.
+
+    Raises
+    ------
+    DatabaseError
+        If there is no such database or it is in use.
+    """
+    if not path.exists():
+        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        ids = {name: image_id for image_id, name in names.items()}
+        num_matches = dict(zip(*database.read_num_matches(), strict=True))
+        for name0, name1 in pairs:
+            known = name0 in ids and name1 in ids
+            if known and database.exists_matches(ids[name0], ids[name1]):
+                num_matches.setdefault(pycolmap.image_pair_to_pair_id(ids[name0], ids[name1]), 0)
+        num_inliers = dict(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
+        verified = []
+        for pair_id in {**num_matches, **num_inliers}:
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            configuration = "UNDEFINED"
+            if database.exists_two_view_geometry(id0, id1):
+                geometry = database.read_two_view_geometry(id0, id1)
+                configuration = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
+            name0, name1 = sorted((names[id0], names[id1]))
+            verified.append(
+                VerifiedPair(
+                    name0=name0,
+                    name1=name1,
+                    num_matches=num_matches.get(pair_id, 0),
+                    num_inliers=num_inliers.get(pair_id, 0),
+                    configuration=configuration,
+                )
+            )
+    return sorted(verified, key=lambda pair: (pair.name0, pair.name1))
+
+
+def _check_not_in_use(path: Path) -> None:
+    """Refuse to replace a database that another process has open.
+
+    Its write-ahead log would stay beside the new file, and SQLite would replay it there.
+    """
+    side_files = [path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal")]
+    if path.is_file() and not any(file.exists() for file in side_files):
+        if path.stat().st_size and not is_sqlite(path):
+            raise DatabaseError(f"{path}: is not a COLMAP database; move it away and try again")
+        return
+    # Opening and closing settles what a killed process has left.
+    with colmap_log(), database_errors(path):
+        if path.exists():
+            pycolmap.Database.open(path).close()
+    if any(file.exists() for file in side_files):
+        raise DatabaseError(
+            f"{path}: is in use by another program; close it there (COLMAP, another corrsfm) and try again"
+        )
+
+
+def _fill(
+    path: Path,
+    images: Sequence[ImageRecord],
+    cameras: Sequence[Camera],
+    features: Callable[[str], Features],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    write_descriptors: bool,
+) -> tuple[int, int]:
+    """Write all tables but the geometries; numbers of repeated matches and of empty pairs."""
+    # COLMAP's verification reads the file through another connection, so it has to be closed before.
+    with pycolmap.Database.open(path) as database:
+        transaction = pycolmap.DatabaseTransaction(database)
+        try:
+            camera_ids = [_write_camera(database, camera) for camera in cameras]
+            num_keypoints: dict[str, int] = {}
+            image_ids: dict[str, int] = {}
+            for image in sorted(images, key=lambda image: image.name):
+                image_id = _write_image(database, image, camera_ids[image.camera_id])
+                image_features = features(image.name)
+                _write_features(database, image_id, image.name, image_features, write_descriptors)
+                image_ids[image.name] = image_id
+                num_keypoints[image.name] = len(image_features)
+            return _write_pairs(database, image_ids, num_keypoints, pruned)
+        finally:
+            # The transaction ends when its object goes; the database must be open then.
+            del transaction
+
+
+def _write_camera(database: pycolmap.Database, camera: Camera) -> int:
+    """Write a camera and the rig that COLMAP wants around it; its id."""
+    written = pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    written.has_prior_focal_length = camera.has_prior_focal_length
+    written.camera_id = database.write_camera(written)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(written.sensor_id)
+    rig.rig_id = written.camera_id
+    database.write_rig(rig, use_rig_id=True)
+    return written.camera_id
+
+
+def _write_image(database: pycolmap.Database, image: ImageRecord, camera_id: int) -> int:
+    """Write an image, its frame and its GPS position; its id."""
+    written = pycolmap.Image(name=image.name, camera_id=camera_id)
+    written.image_id = database.write_image(written)
+    frame = pycolmap.Frame()
+    frame.rig_id = camera_id
+    frame.add_data_id(written.data_id)
+    database.write_frame(frame)
+    if image.gps is not None:
+        prior = pycolmap.PosePrior(
+            corr_data_id=written.data_id,
+            position=np.array(image.gps, np.float64),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+        )
+        database.write_pose_prior(prior)
+    return written.image_id
+
+
+def _write_features(
+    database: pycolmap.Database, image_id: int, name: str, features: Features, write_descriptors: bool
+) -> None:
+    if not np.isfinite(features.keypoints).all():
+        raise InputError(f"{name}: a keypoint is not a finite number; extract its features again")
+    keypoints = np.column_stack([features.keypoints, features.scales, features.orientations])
+    database.write_keypoints(image_id, np.ascontiguousarray(keypoints, np.float32))
+    if write_descriptors:
+        database.write_descriptors(
+            image_id,
+            pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors),
+        )
+
+
+def _write_pairs(
+    database: pycolmap.Database,
+    image_ids: dict[str, int],
+    num_keypoints: dict[str, int],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+) -> tuple[int, int]:
+    """Write the matches of all pairs; numbers of repeated matches and of empty pairs."""
+    num_duplicates = num_empty = 0
+    for name0, name1, indices in pruned:
+        _check_pair(database, image_ids, num_keypoints, name0, name1, indices)
+        # COLMAP would drop a repeated row later, with a warning for each.
+        _, first = np.unique(indices, axis=0, return_index=True)
+        unique = indices[np.sort(first)]
+        num_duplicates += len(indices) - len(unique)
+        num_empty += len(unique) == 0
+        database.write_matches(image_ids[name0], image_ids[name1], unique.astype(np.uint32))
+    return num_duplicates, num_empty
+
+
+def _check_pair(
+    database: pycolmap.Database,
+    image_ids: dict[str, int],
+    num_keypoints: dict[str, int],
+    name0: str,
+    name1: str,
+    indices: NDArray[np.int32],
+) -> None:
+    """Catch what pycolmap would take without a word, or answer with "constraint failed"."""
+    pair = f"pair {name0} – {name1}"
+    for name in (name0, name1):
+        if name not in image_ids:
+            raise InputError(f"{pair}: {name} is not among the photos; make the pairs and matches again")
+    if name0 == name1:
+        raise InputError(f"{pair}: a photo cannot be matched with itself; remove the pair from the list")
+    if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
+        raise InputError(
+            f"{pair}: matches are {indices.dtype} of shape {indices.shape}, expected integers (K, 2)"
+        )
+    for name, column in ((name0, indices[:, 0]), (name1, indices[:, 1])):
+        if len(column) and (column.min() < 0 or column.max() >= num_keypoints[name]):
+            wrong = int(column.min() if column.min() < 0 else column.max())
+            raise InputError(
+                f"{pair}: a match uses keypoint {wrong} of {name}, which has {num_keypoints[name]}; "
+                "the matches belong to other features, match and prune again"
+            )
+    if database.exists_matches(image_ids[name0], image_ids[name1]):
+        raise InputError(f"{pair}: occurs twice; remove one of them from the list of pairs")
