@@ -32,6 +32,7 @@ __all__ = [
     "PairStrategy",
     "PairsConfig",
     "PipelineConfig",
+    "Precision",
     "PruneConfig",
     "PruneMethod",
     "ReconstructionConfig",
@@ -86,6 +87,14 @@ class OperatingPoint(StrEnum):
 
     SFM = "sfm"
     POSE = "pose"
+
+
+class Precision(StrEnum):
+    """Number formats of the network."""
+
+    AUTO = "auto"
+    FLOAT32 = "float32"
+    BFLOAT16 = "bfloat16"
 
 
 class Mapper(StrEnum):
@@ -144,6 +153,7 @@ class FeaturesConfig:
         1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
     )
     root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
+    skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,6 +196,9 @@ class PruneConfig:
     max_ratio: float = option(0.8, "Largest descriptor distance ratio of the ratio test", minimum=0)
     max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", minimum=0)
     max_candidates: int = option(2000, "Matches per pair that the network sees, best ratio first", minimum=16)
+    precision: Precision = option(
+        Precision.AUTO, "Number format of the network; auto is bfloat16 where the processor has it"
+    )
     max_batch_matches: int = option(
         16000,
         "Matches in one network batch, padding included; bounds memory",

@@ -1,7 +1,7 @@
-"""The index of a workspace: which photos there are and which cameras took them.
+"""The index of a workspace: which photos there are, which cameras took them and which pairs to match.
 
-`images.txt` names the photos, one per line, for people and other tools; `images.json` holds the same with
-hashes, cameras, masks and GPS positions.
+`images.txt` names the photos and `pairs.txt` the pairs, one per line, for people and other tools;
+`images.json` adds hashes, cameras, masks and GPS positions, `pair_origins.tsv` where each pair came from.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from corrsfm.errors import WorkspaceError
-from corrsfm.types import Camera, ImageRecord
+from corrsfm.types import Camera, ImageRecord, PairList
 from corrsfm.workspace import Workspace, atomic_write_json, atomic_write_text
 
-__all__ = ["Index", "read_index", "write_index"]
+__all__ = ["Index", "read_index", "read_pairs", "write_index", "write_pairs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,3 +81,35 @@ def read_index(workspace: Workspace) -> Index:
 def _tuples(entry: dict[str, Any], key: str) -> dict[str, Any]:
     """JSON has no tuples."""
     return {**entry, key: tuple(entry[key]) if entry[key] is not None else None}
+
+
+def write_pairs(workspace: Workspace, pair_list: PairList) -> None:
+    """Write `pair_origins.tsv`, then `pairs.txt`, which hloc reads too."""
+    lines = [f"{name0} {name1}\n" for name0, name1 in pair_list.pairs]
+    origins = [
+        f"{name0}\t{name1}\t{','.join(origin)}\n"
+        for (name0, name1), origin in zip(pair_list.pairs, pair_list.origins, strict=True)
+    ]
+    atomic_write_text(workspace.pair_origins, "".join(origins))
+    atomic_write_text(workspace.pairs, "".join(lines))
+
+
+def read_pairs(workspace: Workspace) -> PairList:
+    """The pairs of a workspace with their origins.
+
+    Raises
+    ------
+    WorkspaceError
+        If they are missing or damaged.
+    """
+    path = workspace.pair_origins
+    try:
+        rows = [line.split("\t") for line in path.read_text(encoding="utf-8").splitlines()]
+        return PairList(
+            pairs=tuple((name0, name1) for name0, name1, _ in rows),
+            origins=tuple(tuple(origin.split(",")) for _, _, origin in rows),
+        )
+    except FileNotFoundError as error:
+        raise WorkspaceError(f"{path}: missing; run: corrsfm pairs {workspace.root}") from error
+    except ValueError as error:
+        raise WorkspaceError(f"{path}: damaged; run: corrsfm pairs {workspace.root} --overwrite") from error

@@ -17,6 +17,7 @@ Crash safety
 
 from __future__ import annotations
 
+import hashlib
 import io
 import sqlite3
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
@@ -286,14 +287,37 @@ class ItemStore(Generic[K, T]):
         with self.reader() as read:
             return read(key)
 
+    def fingerprints(self, keys: Iterable[K]) -> dict[K, str]:
+        """Fingerprints of items in the file; of items that another tool wrote, a hash of what they hold.
+
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing or unreadable, or holds no such item.
+        """
+        with self._open() as file:
+            return {key: self._fingerprint(file, key) for key in keys}
+
+    def _fingerprint(self, file: h5py.File, key: K) -> str:
+        group = file.get(self.kind.group(key))
+        if group is None:
+            raise WorkspaceError(f"{self.path}: holds nothing for {key}; run the step that makes it again")
+        if "fingerprint" in group.attrs:
+            return str(group.attrs["fingerprint"])
+        digest = hashlib.sha256()
+        for name in sorted(group):
+            if isinstance(group[name], h5py.Dataset):
+                digest.update(name.encode())
+                digest.update(np.ascontiguousarray(group[name][()]).tobytes())
+        return digest.hexdigest()
+
     def finished(self, wanted: Mapping[K, str]) -> set[K]:
         """Keys whose item is already there with the wanted fingerprint, in the file or the journal."""
         found: set[K] = set()
         if self.path.exists():
             with self._open() as file:
                 for key, fingerprint in wanted.items():
-                    group = file.get(self.kind.group(key))
-                    if group is not None and group.attrs.get("fingerprint") == fingerprint:
+                    if self.kind.group(key) in file and self._fingerprint(file, key) == fingerprint:
                         found.add(key)
         if self.journal_path.exists():
             rows = dict(self._connection().execute("SELECT key, fingerprint FROM items"))
@@ -378,7 +402,7 @@ class ItemStore(Generic[K, T]):
                 )
                 if row is not None:
                     self._write_group(target, name, fingerprint, row[0])
-                elif source is not None and source.get(name) is not None:
+                elif source is not None and name in source and self._fingerprint(source, key) == fingerprint:
                     source.copy(source[name], target, name=name, shallow=False)
                 else:
                     raise WorkspaceError(f"{self.path}: {key} was never finished; run again")

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import json
 import os
 import shutil
@@ -37,9 +36,26 @@ from typing import Any
 
 from corrsfm.errors import WorkspaceError
 
-__all__ = ["StageRecord", "Workspace", "atomic_path", "atomic_write_json", "atomic_write_text"]
+__all__ = [
+    "STAGE_COMMANDS",
+    "StageRecord",
+    "Workspace",
+    "atomic_path",
+    "atomic_write_json",
+    "atomic_write_text",
+]
 
 FORMAT_VERSION = 1
+STAGE_COMMANDS = {
+    "images": "extract IMAGES {workspace}",
+    "features": "extract IMAGES {workspace}",
+    "pairs": "pairs {workspace}",
+    "matches": "match {workspace}",
+    "pruned matches": "prune {workspace}",
+    "verified matches": "prune {workspace}",
+    "models": "reconstruct {workspace}",
+}
+"""The stages, in order, and the command that makes each."""
 
 
 @contextlib.contextmanager
@@ -110,6 +126,8 @@ class StageRecord:
         Hash of the stage's options and of the fingerprints of its inputs.
     config : dict
         The options, for people to read.
+    inputs : dict
+        Stage → fingerprint of what it read.
     seconds : float
         Wall-clock seconds of the run that finished it.
     num_items, num_reused : int
@@ -118,6 +136,7 @@ class StageRecord:
 
     fingerprint: str
     config: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     num_items: int = 0
     num_reused: int = 0
@@ -247,8 +266,8 @@ class Workspace:
             and all(path.exists() for path in artefacts)
         )
 
-    def require(self, stage: str, command: str) -> StageRecord:
-        """The record of a stage that must have finished.
+    def require(self, stage: str) -> StageRecord:
+        """The record of a stage that must have finished, with inputs that have not changed since.
 
         Raises
         ------
@@ -257,8 +276,16 @@ class Workspace:
         """
         record = self.record_of(stage)
         if record is None:
-            raise WorkspaceError(f"{self.root}: {stage} not done yet; run: {command}")
+            raise WorkspaceError(f"{self.root}: no {stage} yet; run: {self._command(stage)}")
+        for name, fingerprint in record.inputs.items():
+            if self.require(name).fingerprint != fingerprint:
+                raise WorkspaceError(
+                    f"{self.root}: {stage} are older than {name}; run: {self._command(stage)}"
+                )
         return record
+
+    def _command(self, stage: str) -> str:
+        return f"corrsfm {STAGE_COMMANDS[stage].format(workspace=self.root)}"
 
     def finish(self, stage: str, record: StageRecord) -> None:
         """Record a stage as finished now."""
@@ -270,8 +297,3 @@ class Workspace:
         """Drop the record of a stage, so that it is not taken for finished."""
         if self._values["stages"].pop(stage, None) is not None:
             atomic_write_json(self.manifest, self._values)
-
-
-def hash_text(*parts: str) -> str:
-    """Hex digest of some strings in order."""
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()

@@ -30,6 +30,8 @@ def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
     if unit := entry.metadata["unit"]:
         text += f" [{unit}]"
     settings: dict[str, Any] = {"help": text + ".", "default": entry.default, "show_default": True}
+    if isinstance(entry.default, StrEnum):
+        settings["default"] = str(entry.default)
     if annotation is bool:
         return click.option(f"{flag}/--no-{flag[2:]}", **settings)
     if isinstance(inner, type) and issubclass(inner, StrEnum):

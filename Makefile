@@ -1,0 +1,40 @@
+# make demo   reconstruct a bundled scene, print the statistics, write a page to look at
+# make test   the default tests (minutes); make test-slow adds the sample scenes end to end
+# make lint   format check, linter, type checker
+
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+STAMP  := $(VENV)/.installed
+
+.PHONY: demo test test-slow lint format clean
+
+$(STAMP): pyproject.toml constraints.txt
+	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[report,evaluate,train,dev]'
+	@touch $@
+
+demo: $(STAMP)
+	@echo "== reconstructing sample_scenes/courtyard into demo/"
+	$(BIN)/corrsfm run sample_scenes/courtyard/images demo
+	@echo "== open demo/report.html in a browser"
+
+test: $(STAMP)
+	$(BIN)/python -m pytest -q
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest -q -m slow
+
+lint: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) demo build dist *.egg-info

@@ -1,0 +1,71 @@
+"""The command line: thin commands over the Python API."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from typing import Any
+
+import click
+
+from corrsfm import __version__
+from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
+from corrsfm.errors import CorrsfmError
+
+__all__ = ["main"]
+
+
+class _Handler(logging.Handler):
+    """Log lines on standard error that do not tear progress bars."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        from tqdm import tqdm
+
+        prefix = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
+        tqdm.write(prefix + record.getMessage(), file=sys.stderr)
+
+
+class _Commands(click.Group):
+    """A group that lists its commands in the order of a reconstruction and turns errors into text."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except CorrsfmError as error:
+            raise click.ClickException(str(error)) from error
+        except KeyboardInterrupt as error:
+            raise click.ClickException("interrupted; run the same command again to go on") from error
+
+
+@click.group(
+    cls=_Commands,
+    # Both spellings of a flag are accepted: --max-features and --max_features.
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "token_normalize_func": lambda t: t.replace("_", "-"),
+    },
+)
+@click.version_option(__version__)
+@click.option("-q", "--quiet", is_flag=True, help="Say nothing but warnings and errors; no progress bars.")
+def main(quiet: bool) -> None:
+    """Structure from motion with learned correspondence pruning.
+
+    `corrsfm run PHOTOS WORKSPACE` does everything; the other commands are its steps. Finished work is kept:
+    after an interruption or a changed option, run the same command again.
+    """
+    logger = logging.getLogger("corrsfm")
+    logger.handlers = [_Handler()]
+    logger.setLevel(logging.WARNING if quiet else logging.INFO)
+    logger.propagate = False
+    if quiet:
+        import os
+
+        # tqdm reads its defaults from the environment at import, which happens later.
+        os.environ["TQDM_DISABLE"] = "1"
+
+
+for _command in (run, extract, pairs, match, prune, reconstruct, report):
+    main.add_command(_command)

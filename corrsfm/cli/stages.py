@@ -1,0 +1,207 @@
+"""The commands that are the steps of a reconstruction, and the one that runs them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from corrsfm import config as cfg
+from corrsfm.cli.options import config_options, echo_json, json_option, overwrite_option, run_options
+
+if TYPE_CHECKING:
+    from corrsfm.pipeline import StageOutcome
+
+__all__ = ["extract", "match", "pairs", "prune", "reconstruct", "report", "run"]
+
+IMAGES = click.argument("images_dir", metavar="IMAGES", type=click.Path(path_type=Path))
+WORKSPACE = click.argument("workspace_dir", metavar="WORKSPACE", type=click.Path(path_type=Path))
+
+
+def _show(outcomes: Sequence[StageOutcome], as_json: bool) -> None:
+    """The outcomes of some stages, for a person or a machine."""
+    if as_json:
+        echo_json([outcome.__dict__ for outcome in outcomes])
+        return
+    for outcome in outcomes:
+        state = "kept" if outcome.skipped else f"{outcome.seconds:.1f} s"
+        click.echo(f"{outcome.stage:<17}{outcome.num_items:>8}   {state}")
+
+
+def _step(
+    function: Callable, workspace_dir: Path, config: object, run: cfg.RunConfig, overwrite: bool
+) -> StageOutcome:
+    from corrsfm.workspace import Workspace
+
+    workspace = Workspace(workspace_dir)
+    with workspace.lock():
+        return function(workspace, config, run, overwrite=overwrite)
+
+
+@click.command()
+@IMAGES
+@WORKSPACE
+@config_options(
+    images=cfg.ImagesConfig, features=cfg.FeaturesConfig, pairs=cfg.PairsConfig, matches=cfg.MatchesConfig
+)
+@run_options
+@overwrite_option
+@json_option
+def extract(
+    images_dir: Path,
+    workspace_dir: Path,
+    images: cfg.ImagesConfig,
+    features: cfg.FeaturesConfig,
+    pairs: cfg.PairsConfig,
+    matches: cfg.MatchesConfig,
+    run: cfg.RunConfig,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Index the photos, extract features, choose pairs and match them."""
+    from corrsfm import pipeline
+    from corrsfm.workspace import Workspace
+
+    workspace = Workspace(workspace_dir, create=True)
+    with workspace.lock():
+        outcomes = [
+            pipeline.index_photos(workspace, images_dir, images, run),
+            pipeline.extract_features(workspace, features, run, overwrite=overwrite),
+            pipeline.make_pairs(workspace, pairs, run, overwrite=overwrite),
+            pipeline.match_pairs(workspace, matches, run, overwrite=overwrite),
+        ]
+    _show(outcomes, as_json)
+
+
+@click.command()
+@WORKSPACE
+@config_options(config=cfg.PairsConfig)
+@run_options
+@overwrite_option
+@json_option
+def pairs(
+    workspace_dir: Path, config: cfg.PairsConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
+) -> None:
+    """Choose again which photos are matched."""
+    from corrsfm import pipeline
+
+    _show([_step(pipeline.make_pairs, workspace_dir, config, run, overwrite)], as_json)
+
+
+@click.command()
+@WORKSPACE
+@config_options(config=cfg.MatchesConfig)
+@run_options
+@overwrite_option
+@json_option
+def match(
+    workspace_dir: Path, config: cfg.MatchesConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
+) -> None:
+    """Match the pairs: the nearest neighbour of every keypoint, with its ratio and whether it is mutual."""
+    from corrsfm import pipeline
+
+    _show([_step(pipeline.match_pairs, workspace_dir, config, run, overwrite)], as_json)
+
+
+@click.command()
+@WORKSPACE
+@config_options(config=cfg.PruneConfig, database=cfg.DatabaseConfig)
+@run_options
+@overwrite_option
+@json_option
+def prune(
+    workspace_dir: Path,
+    config: cfg.PruneConfig,
+    database: cfg.DatabaseConfig,
+    run: cfg.RunConfig,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Prune the putative matches and write the COLMAP database with verified two-view geometries."""
+    from corrsfm import pipeline
+
+    outcomes = [
+        _step(pipeline.prune_matches, workspace_dir, config, run, overwrite),
+        _step(pipeline.verify_matches, workspace_dir, database, run, overwrite),
+    ]
+    _show(outcomes, as_json)
+
+
+@click.command()
+@WORKSPACE
+@config_options(config=cfg.ReconstructionConfig)
+@run_options
+@overwrite_option
+@json_option
+def reconstruct(
+    workspace_dir: Path, config: cfg.ReconstructionConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
+) -> None:
+    """Map the verified matches into COLMAP models, the largest at sparse/0, and print the statistics."""
+    from corrsfm import pipeline
+
+    _step(pipeline.reconstruct, workspace_dir, config, run, overwrite)
+    _print_report(workspace_dir, as_json)
+
+
+@click.command()
+@WORKSPACE
+@json_option
+def report(workspace_dir: Path, as_json: bool) -> None:
+    """Print the statistics of a reconstruction and write report.json and report.html."""
+    _print_report(workspace_dir, as_json, html=True)
+
+
+@click.command()
+@IMAGES
+@WORKSPACE
+@click.option(
+    "--pipeline", type=click.Path(path_type=Path), help="Pipeline file in TOML; flags typed here override it."
+)
+@config_options(
+    images=cfg.ImagesConfig,
+    features=cfg.FeaturesConfig,
+    pairs=cfg.PairsConfig,
+    matches=cfg.MatchesConfig,
+    prune=cfg.PruneConfig,
+    database=cfg.DatabaseConfig,
+    reconstruction=cfg.ReconstructionConfig,
+)
+@run_options
+@overwrite_option
+@json_option
+def run(
+    images_dir: Path,
+    workspace_dir: Path,
+    pipeline: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **configs: object,
+) -> None:
+    """Do everything: from a folder of photos to models and a report."""
+    from corrsfm import scene_run
+
+    scene_run.run_scene(
+        images_dir, workspace_dir, cfg.PipelineConfig(**configs), pipeline_file=pipeline, overwrite=overwrite
+    )  # type: ignore[arg-type]
+    _print_report(workspace_dir, as_json)
+    if not as_json:
+        click.echo(f"\nreport: {workspace_dir / 'report.html'}")
+
+
+def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> None:
+    """The statistics on standard output; report.json always, report.html if asked for."""
+    from corrsfm import pipeline
+    from corrsfm.report import format_table, report_to_dict
+    from corrsfm.workspace import Workspace
+
+    workspace = Workspace(workspace_dir)
+    with workspace.lock():
+        result = pipeline.report(workspace, html=html)
+    if as_json:
+        echo_json(report_to_dict(result))
+    else:
+        click.echo(format_table(result))
+        if html:
+            click.echo(f"\nreport: {workspace.report_html}")

@@ -1,0 +1,70 @@
+"""What this process may use of the machine: threads and a device."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from corrsfm.config import RunConfig
+from corrsfm.errors import ConfigError
+
+__all__ = ["device_of", "threaded", "threads_of", "use_threads"]
+
+K = TypeVar("K")
+R = TypeVar("R")
+
+
+def threads_of(run: RunConfig) -> int:
+    """Number of threads to use: the ones asked for, or all this process may have."""
+    if run.threads:
+        return run.threads
+    # Inside a batch job the machine has more cores than the job.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def device_of(run: RunConfig) -> str:
+    """Torch device to use.
+
+    Raises
+    ------
+    ConfigError
+        If the device is not there.
+    """
+    import torch
+
+    if run.device == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        torch.zeros(1, device=run.device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"--device {run.device}: not available here; try --device auto or cpu") from error
+    return run.device
+
+
+def use_threads(run: RunConfig) -> None:
+    """Let torch use these threads."""
+    import torch
+
+    torch.set_num_threads(threads_of(run))
+
+
+def threaded(work: Callable[[K], R], keys: Iterable[K], run: RunConfig) -> Iterator[tuple[K, R]]:
+    """Results of ``work`` in the order of the keys, a few ahead of the consumer."""
+    num_threads = threads_of(run)
+    with ThreadPoolExecutor(num_threads) as pool:
+        waiting: list[tuple[K, Any]] = []
+        iterator = iter(keys)
+        try:
+            while True:
+                for key in itertools.islice(iterator, 2 * num_threads - len(waiting)):
+                    waiting.append((key, pool.submit(work, key)))
+                if not waiting:
+                    return
+                key, future = waiting.pop(0)
+                yield key, future.result()
+        finally:
+            for _, future in waiting:
+                future.cancel()

@@ -1,0 +1,366 @@
+"""The stages in order: each reads and writes files of a workspace and skips what is finished.
+
+Every function here takes a workspace and the options of its stage and returns a `StageOutcome`.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from tqdm import tqdm
+
+from corrsfm import config as cfg
+from corrsfm.config import config_hash
+from corrsfm.errors import ImageError, InputError, WorkspaceError
+from corrsfm.index import Index, read_index, read_pairs, write_index, write_pairs
+from corrsfm.machine import device_of, threaded, threads_of, use_threads
+from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
+from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
+from corrsfm.types import Correspondences, Features, ImageRecord, Matches, Pair, PairList
+from corrsfm.workspace import Workspace
+
+__all__ = [
+    "StageOutcome",
+    "extract_features",
+    "index_photos",
+    "make_pairs",
+    "match_pairs",
+    "prune_matches",
+    "reconstruct",
+    "verify_matches",
+]
+
+logger = logging.getLogger("corrsfm")
+
+CACHED_IMAGES = 512
+# LO-RANSAC runs a batch of pairs on native threads; a killed run loses at most one batch, a few seconds.
+PAIRS_PRUNED_TOGETHER = 128
+
+
+def index_photos(
+    workspace: Workspace, images_dir: Path, config: cfg.ImagesConfig, run: cfg.RunConfig
+) -> StageOutcome:
+    """List the photos, read their cameras and write the index.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two photos, or the folder, list, masks or camera options cannot be used.
+    """
+    from corrsfm.images import duplicate_images, index_images
+
+    started = time.monotonic()
+    records, cameras = index_images(images_dir, config)
+    check_hloc_keys(record.name for record in records)
+    for names in duplicate_images(records):
+        logger.warning("photos with the same content: %s", ", ".join(names))
+    index = Index(records=tuple(records), cameras=tuple(cameras))
+    fingerprint = config_hash("images", index.records, index.cameras)
+    explain_photos(workspace, index)
+    if not workspace.is_current("images", fingerprint, workspace.images_json, workspace.images_txt):
+        workspace.forget("images")
+        write_index(workspace, index)
+    workspace.images_dir = images_dir
+    outcome = StageOutcome(stage="images", num_items=len(records), seconds=time.monotonic() - started)
+    finish(workspace, outcome, fingerprint, config)
+    return outcome
+
+
+def extract_features(
+    workspace: Workspace, config: cfg.FeaturesConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Extract the features of every photo of the index.
+
+    Raises
+    ------
+    ImageError
+        Naming every photo that cannot be read; the features of the others are kept.
+    """
+    from corrsfm.features import create_extractor
+    from corrsfm.images import read_image, read_mask
+
+    index = read_index(workspace)
+    images = workspace.require("images")
+    wanted = {
+        record.name: config_hash("features", record.sha256, record.mask_sha256 or "", config)
+        for record in index.records
+    }
+    records = {record.name: record for record in index.records}
+    extract = create_extractor(config)
+    mask_dir = images.config.get("mask_dir")
+    unreadable: list[str] = []
+
+    def work(name: str) -> Features | ImageError:
+        record = records[name]
+        try:
+            image = read_image(workspace.images_dir / name)
+            mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
+            return extract(image, mask)
+        except ImageError as error:
+            return error
+
+    def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
+        for name, result in threaded(work, missing, run):
+            if isinstance(result, Features):
+                yield name, result
+            elif config.skip_unreadable:
+                logger.warning("left out: %s", result)
+                yield name, _no_features(index, records[name])
+            else:
+                unreadable.append(str(result))
+        if unreadable:
+            raise ImageError(
+                "\n".join(unreadable)
+                + "\nremove or replace these photos and run again, or use --skip-unreadable; the features of "
+                "the others are kept"
+            )
+
+    return complete(
+        workspace,
+        "features",
+        ItemStore(workspace.features, FEATURES),
+        wanted,
+        produce,
+        config,
+        inputs={"images": images.fingerprint},
+        overwrite=overwrite,
+        unit="photo",
+    )
+
+
+def make_pairs(
+    workspace: Workspace, config: cfg.PairsConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Choose the pairs to match, and warn if they do not connect all photos."""
+    from corrsfm import pairs as pairing
+
+    started = time.monotonic()
+    index = read_index(workspace)
+    features = workspace.require("features")
+    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
+    fingerprint = config_hash(
+        "pairs", config, run.seed, [[r.name, r.gps] for r in index.records], features.fingerprint, *files
+    )
+    if not overwrite and workspace.is_current("pairs", fingerprint, workspace.pairs, workspace.pair_origins):
+        pair_list = read_pairs(workspace)
+        _warn_if_disconnected(index, pair_list)
+        return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
+    explain(workspace, "pairs", config)
+    with ItemStore(workspace.features, FEATURES).reader() as read:
+        pair_list = pairing.make_pairs(index.records, config, load_features=read, seed=run.seed)
+    if not len(pair_list):
+        raise InputError(
+            f"{workspace.root}: no pair of photos to match; choose another --pairing or larger neighbourhoods"
+        )
+    _warn_if_disconnected(index, pair_list)
+    workspace.forget("pairs")
+    write_pairs(workspace, pair_list)
+    outcome = StageOutcome(stage="pairs", num_items=len(pair_list), seconds=time.monotonic() - started)
+    finish(workspace, outcome, fingerprint, config, inputs={"features": features.fingerprint})
+    return outcome
+
+
+def match_pairs(
+    workspace: Workspace, config: cfg.MatchesConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Find the putative matches of every pair."""
+    from corrsfm.matches import Matcher
+
+    features = workspace.require("features")
+    pairs = workspace.require("pairs")
+    store = ItemStore(workspace.features, FEATURES)
+    wanted = _wanted_matches(workspace)
+    use_threads(run)
+    with store.reader() as read:
+        matcher = Matcher(
+            lambda name: read(name).descriptors, device=device_of(run), block_size=config.block_size
+        )
+
+        def produce(missing: list[Pair]) -> Iterator[tuple[Pair, Matches]]:
+            for pair in missing:
+                yield pair, matcher.match(*pair)
+
+        return complete(
+            workspace,
+            "matches",
+            ItemStore(workspace.matches, MATCHES),
+            wanted,
+            produce,
+            config,
+            inputs={"features": features.fingerprint, "pairs": pairs.fingerprint},
+            overwrite=overwrite,
+            unit="pair",
+        )
+
+
+def prune_matches(
+    workspace: Workspace, config: cfg.PruneConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Prune the putative matches of every pair."""
+    from corrsfm.prune import build_pruner, make_correspondences
+
+    index = read_index(workspace)
+    cameras = {record.name: index.camera_of(record) for record in index.records}
+    matches = workspace.require("matches")
+    putative = ItemStore(workspace.matches, MATCHES)
+    match_fingerprints = _wanted_matches(workspace)
+    if len(putative.finished(match_fingerprints)) < len(match_fingerprints):
+        raise WorkspaceError(
+            f"{workspace.matches}: older than the features; run: corrsfm match {workspace.root}"
+        )
+    pruner = build_pruner(config, device=device_of(run), seed=run.seed, threads=threads_of(run))
+    wanted = {
+        pair: config_hash("prune", fingerprint, pruner.fingerprint, cameras[pair[0]], cameras[pair[1]])
+        for pair, fingerprint in match_fingerprints.items()
+    }
+    use_threads(run)
+    with ItemStore(workspace.features, FEATURES).reader() as load, putative.reader() as read_matches:
+        read_features = functools.lru_cache(maxsize=CACHED_IMAGES)(load)
+
+        def gather(pair: Pair, found: Matches) -> Correspondences:
+            features0, features1 = (read_features(name) for name in pair)
+            camera0, camera1 = (cameras[name] for name in pair)
+            return make_correspondences(features0, features1, found, camera0, camera1, " – ".join(pair))
+
+        def produce(missing: list[Pair]) -> Iterator[tuple[Pair, PrunedMatches]]:
+            for start in range(0, len(missing), PAIRS_PRUNED_TOGETHER):
+                batch = [
+                    (pair, read_matches(pair)) for pair in missing[start : start + PAIRS_PRUNED_TOGETHER]
+                ]
+                results = pruner([gather(pair, found) for pair, found in batch])
+                for (pair, found), result in zip(batch, results, strict=True):
+                    yield pair, PrunedMatches.from_result(found, result)
+
+        return complete(
+            workspace,
+            "pruned matches",
+            ItemStore(workspace.pruned, PRUNED),
+            wanted,
+            produce,
+            config,
+            inputs={"matches": matches.fingerprint},
+            overwrite=overwrite,
+            unit="pair",
+        )
+
+
+def verify_matches(
+    workspace: Workspace, config: cfg.DatabaseConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Write the COLMAP database and verify the pruned matches geometrically."""
+    from corrsfm.database import write_database
+
+    started = time.monotonic()
+    index = read_index(workspace)
+    pruned = workspace.require("pruned matches")
+    fingerprint = config_hash("verified matches", pruned.fingerprint, index.cameras, config, run.seed)
+    pair_list = read_pairs(workspace)
+    if not overwrite and workspace.is_current("verified matches", fingerprint, workspace.database):
+        return StageOutcome(
+            stage="verified matches", num_items=len(pair_list), num_reused=len(pair_list), skipped=True
+        )
+    explain(workspace, "verified matches", config)
+    workspace.forget("verified matches")
+    with (
+        ItemStore(workspace.features, FEATURES).reader() as read_features,
+        ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
+    ):
+        write_database(
+            workspace.database,
+            images=index.records,
+            cameras=index.cameras,
+            features=read_features,
+            pruned=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
+            config=config,
+            seed=run.seed,
+            num_threads=threads_of(run),
+            log_file=workspace.log,
+        )
+    outcome = StageOutcome(
+        stage="verified matches", num_items=len(pair_list), seconds=time.monotonic() - started
+    )
+    finish(workspace, outcome, fingerprint, config, inputs={"pruned matches": pruned.fingerprint})
+    return outcome
+
+
+def reconstruct(
+    workspace: Workspace, config: cfg.ReconstructionConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Map the verified database into models, the largest at `sparse/0`.
+
+    Raises
+    ------
+    ReconstructionError
+        If no model came out, with the reason.
+    """
+    from corrsfm.reconstruction import reconstruct as map_database
+
+    started = time.monotonic()
+    verified = workspace.require("verified matches")
+    fingerprint = config_hash("models", verified.fingerprint, config, run.seed)
+    if not overwrite and workspace.is_current("models", fingerprint, workspace.sparse / "0"):
+        num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
+        return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
+    explain(workspace, "models", config)
+    workspace.forget("models")
+    num_images = len(read_index(workspace).records)
+    with tqdm(total=num_images, desc="mapping", unit="photo", leave=False) as bar:
+
+        def on_progress(num_registered: int) -> None:
+            bar.n = num_registered
+            bar.refresh()
+
+        models = map_database(
+            workspace.database,
+            workspace.images_dir,
+            workspace.sparse,
+            config=config,
+            seed=run.seed,
+            threads=threads_of(run),
+            log_path=workspace.log,
+            on_progress=on_progress,
+        )
+    outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
+    finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
+    return outcome
+
+
+def _warn_if_disconnected(index: Index, pair_list: PairList) -> None:
+    from corrsfm.pairs import describe_components
+
+    text = describe_components(index.names, pair_list.pairs)
+    if text:
+        logger.warning("%s", text)
+
+
+def _content(path: Path) -> str:
+    """Hash of what a file or all files of a folder hold; missing ones are reported by whoever reads them."""
+    from corrsfm.images import hash_file
+
+    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    return config_hash(*[[file.name, hash_file(file)] for file in files if file.is_file()])
+
+
+def _wanted_matches(workspace: Workspace) -> dict[Pair, str]:
+    """Fingerprint that the putative matches of each pair must carry."""
+    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(read_index(workspace).names)
+    return {
+        pair: config_hash("matches", fingerprints[pair[0]], fingerprints[pair[1]])
+        for pair in read_pairs(workspace).pairs
+    }
+
+
+def _no_features(index: Index, record: ImageRecord) -> Features:
+    """Features of a photo that was left out."""
+    import numpy as np
+
+    camera = index.camera_of(record)
+    none = np.zeros(0, np.float32)
+    return Features(
+        keypoints=np.zeros((0, 2), np.float32), scales=none, orientations=none, scores=none,
+        descriptors=np.zeros((0, 128), np.uint8), image_size=(camera.width, camera.height),
+    )  # fmt: skip

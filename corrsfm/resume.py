@@ -1,0 +1,160 @@
+"""Bringing the items of a stage up to date: keep what is there, do what is missing, say why.
+
+An item (a photo's features, a pair's matches) carries the fingerprint of everything it was made from. A stage
+is the set of its items; it is current when every item is there with the fingerprint wanted now.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from corrsfm import config as cfg
+from corrsfm.errors import WorkspaceError
+from corrsfm.index import Index, read_index
+from corrsfm.store import ItemStore
+from corrsfm.workspace import StageRecord, Workspace
+
+__all__ = ["StageOutcome", "complete", "explain", "explain_photos", "finish"]
+
+logger = logging.getLogger("corrsfm")
+
+K = TypeVar("K")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOutcome:
+    """What a stage did.
+
+    Attributes
+    ----------
+    stage : str
+    num_items, num_reused : int
+        Items of the stage, and how many of them were there already.
+    seconds : float
+        Wall-clock seconds of this call.
+    skipped : bool
+        True if nothing was to do.
+    """
+
+    stage: str
+    num_items: int
+    num_reused: int = 0
+    seconds: float = 0.0
+    skipped: bool = False
+
+
+def complete(
+    workspace: Workspace,
+    stage: str,
+    store: ItemStore[K, T],
+    wanted: Mapping[K, str],
+    produce: Callable[[list[K]], Iterable[tuple[K, T]]],
+    config: Any,
+    *,
+    inputs: dict[str, str],
+    overwrite: bool,
+    unit: str,
+) -> StageOutcome:
+    """Bring a store of items to exactly the wanted ones, keeping those that are there.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    stage : str
+    store : ItemStore
+    wanted : mapping
+        Key → fingerprint of every item the stage consists of.
+    produce : callable
+        Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for.
+    config : dataclass
+        The stage's options, for the record.
+    inputs : dict
+        Stage → fingerprint of what the items are made from.
+    overwrite : bool
+        Do all items again.
+    unit : str
+        What an item is, for the progress bar.
+    """
+    started = time.monotonic()
+    fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
+    finished = set() if overwrite else store.finished(wanted)
+    missing = [key for key in wanted if key not in finished]
+    if not missing and workspace.is_current(stage, fingerprint, store.path):
+        store.discard_journal()
+        return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
+    explain(workspace, stage, config)
+    if finished and missing:
+        logger.info("%s: %d of %d kept, %d to do", stage, len(finished), len(wanted), len(missing))
+    try:
+        with tqdm(total=len(wanted), initial=len(finished), desc=stage, unit=unit, leave=False) as bar:
+            for key, item in produce(missing):
+                store.add(key, wanted[key], item)
+                bar.update()
+        workspace.forget(stage)
+        store.commit(wanted)
+    finally:
+        store.close()
+    outcome = StageOutcome(
+        stage=stage, num_items=len(wanted), num_reused=len(finished), seconds=time.monotonic() - started
+    )
+    finish(workspace, outcome, fingerprint, config, inputs=inputs)
+    return outcome
+
+
+def finish(
+    workspace: Workspace,
+    outcome: StageOutcome,
+    fingerprint: str,
+    config: Any,
+    inputs: dict[str, str] | None = None,
+) -> None:
+    workspace.finish(
+        outcome.stage,
+        StageRecord(
+            fingerprint=fingerprint,
+            config=cfg.to_dict(config),
+            inputs=inputs or {},
+            seconds=round(outcome.seconds, 3),
+            num_items=outcome.num_items,
+            num_reused=outcome.num_reused,
+        ),
+    )
+
+
+def explain(workspace: Workspace, stage: str, config: Any) -> None:
+    """Say which changed option makes a finished stage stale."""
+    record = workspace.record_of(stage)
+    if record is None:
+        return
+    new = cfg.to_dict(config)
+    changes = [
+        f"{key} {record.config.get(key)} → {new[key]}" for key in new if record.config.get(key) != new[key]
+    ]
+    reason = ", ".join(changes) if changes else "what it depends on changed"
+    logger.info("%s: redone where needed (%s)", stage, reason)
+
+
+def explain_photos(workspace: Workspace, index: Index) -> None:
+    """Say which photos changed since the workspace last saw them."""
+    if workspace.record_of("images") is None:
+        return
+    try:
+        before = {record.name: record.sha256 for record in read_index(workspace).records}
+    except WorkspaceError:
+        return
+    now = {record.name: record.sha256 for record in index.records}
+    for text, names in (
+        ("new", now.keys() - before.keys()),
+        ("gone", before.keys() - now.keys()),
+        ("changed", {name for name in now.keys() & before.keys() if now[name] != before[name]}),
+    ):
+        if names:
+            shown = ", ".join(sorted(names)[:5]) + (", …" if len(names) > 5 else "")
+            logger.info("photos %s since the last run: %d (%s)", text, len(names), shown)
