@@ -26,8 +26,8 @@ __all__ = ["create_extractor", "extract_features", "quantise_descriptors", "scal
 # OpenCV divides its threshold by the three layers of an octave. The value is far below its default of 0.04
 # so that photos of low texture reach `max_features` too; keeping the strongest does the selection.
 OPENCV_CONTRAST_THRESHOLD = 0.005
-# COLMAP's default is 0.0067; lowered to the same contrast as OpenCV's.
-PYCOLMAP_PEAK_THRESHOLD = OPENCV_CONTRAST_THRESHOLD / 3
+# COLMAP's default. Lowering it is no help there: what is added competes by scale, not by strength.
+PYCOLMAP_PEAK_THRESHOLD = 0.02 / 3
 DESCRIPTOR_SIZE = 128
 
 
@@ -163,6 +163,7 @@ def _detect_opencv(
         return np.zeros((0, 4)), np.zeros(0), np.zeros((0, DESCRIPTOR_SIZE), np.uint8)
     scores = np.array([keypoint.response for keypoint in keypoints])
     # OpenCV's own quantisation is COLMAP's.
+    raw = np.asarray(raw, np.float32)
     descriptors = quantise_descriptors(raw, root_sift=True) if root_sift else raw.astype(np.uint8)
     return _opencv_geometry(keypoints), scores, descriptors
 
