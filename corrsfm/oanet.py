@@ -31,6 +31,7 @@ from corrsfm.workspace import atomic_path
 __all__ = [
     "OANetPair",
     "count_pairs",
+    "is_oanet_file",
     "pinhole_parameters",
     "read_pairs",
     "select_per_scene",
@@ -160,6 +161,18 @@ def count_pairs(path: Path) -> int:
     """
     with _open(path) as handle:
         return len(_indices(handle, path))
+
+
+def is_oanet_file(path: Path) -> bool:
+    """Whether a file is in OANet's layout rather than in another HDF5 one.
+
+    Raises
+    ------
+    InputError
+        If it is no HDF5 file.
+    """
+    with _open(path) as handle:
+        return "xs" in handle
 
 
 def _indices(handle: h5py.File, path: Path) -> list[str]:

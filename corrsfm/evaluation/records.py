@@ -1,0 +1,111 @@
+"""Result files: what was measured, with everything needed to measure it again.
+
+A result file is JSON with ``kind``, ``provenance`` (versions, machine, seed, command), ``subject`` (what it
+was measured on, with hashes) and ``methods``. Each method carries a fingerprint, so a repeated run measures
+only what is new or changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import re
+from pathlib import Path
+from typing import Any
+
+import corrsfm
+from corrsfm.errors import InputError
+from corrsfm.workspace import atomic_write_text
+
+__all__ = ["file_sha256", "load_results", "provenance", "save_results"]
+
+FORMAT_VERSION = 1
+_LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap", "poselib", "torch", "h5py")
+
+
+def provenance(*, seed: int, command: str = "", device: str = "cpu") -> dict[str, Any]:
+    """Versions, machine, seed and command of a measurement."""
+    versions = {"corrsfm": corrsfm.__version__, "python": platform.python_version()}
+    for library in _LIBRARIES:
+        try:
+            versions[library] = importlib.metadata.version(library)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {
+        "versions": versions,
+        "machine": {
+            "system": f"{platform.system()} {platform.machine()}",
+            "processor": _processor(),
+            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "device": _device_name(device),
+        },
+        "seed": seed,
+        "command": command,
+    }
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor()
+
+
+def _device_name(device: str) -> str:
+    if not device.startswith("cuda"):
+        return device
+    import torch
+
+    return torch.cuda.get_device_name(device)
+
+
+def file_sha256(path: Path) -> str:
+    """Hex digest of a file's bytes, read in pieces.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read.
+    """
+    try:
+        with open(path, "rb") as handle:
+            return hashlib.file_digest(handle, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:
+    """Read a result file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, of another version or of another kind than wanted.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        version, found = values["format_version"], values["kind"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: not a result file ({error}); make it with: corrsfm evaluate, or delete it"
+        ) from error
+    if version != FORMAT_VERSION or (kind is not None and found != kind):
+        raise InputError(
+            f"{path}: result file of kind {found}, version {version}; expected {kind or found}, "
+            f"version {FORMAT_VERSION}; choose another --results file"
+        )
+    return values
+
+
+def save_results(path: Path, kind: str, values: dict[str, Any]) -> None:
+    """Write a result file whole or not at all."""
+    text = json.dumps({"format_version": FORMAT_VERSION, "kind": kind, **values}, indent=1, allow_nan=False)
+    # Lists of numbers on one line each: files stay readable and small, and differ line by line.
+    text = re.sub(r"\[\n[^\[\]{}]*\]", lambda match: re.sub(r"\n\s*", " ", match[0]), text)
+    atomic_write_text(path, text + "\n")
