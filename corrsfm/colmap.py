@@ -1,4 +1,4 @@
-"""How corrsfm talks to pycolmap: a log that does not reach the terminal, and failures in plain words.
+"""How corrsfm talks to pycolmap: a quiet log, failures in plain words, and models in numbers.
 
 pycolmap's log is one per process (glog), so `colmap_log` is not for use from several threads at once.
 """
@@ -13,11 +13,21 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
-from corrsfm.errors import DatabaseError
+from corrsfm.errors import DatabaseError, WorkspaceError
+from corrsfm.types import ModelSummary
 
-__all__ = ["colmap_log", "database_errors", "is_sqlite"]
+__all__ = [
+    "colmap_log",
+    "database_errors",
+    "is_sqlite",
+    "observation_errors",
+    "read_models",
+    "summarise_model",
+]
 
 _SILENT = 3
 _SMALLEST_DISK_BYTES = 1 << 20
@@ -134,3 +144,72 @@ def _is_locked(path: Path) -> bool:
     except sqlite3.OperationalError as error:
         return "locked" in str(error)
     return False
+
+
+def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
+    """Read the models ``folder/0``, ``folder/1`` … in this order.
+
+    Raises
+    ------
+    WorkspaceError
+        If there is none, or one cannot be read.
+    """
+    models: list[pycolmap.Reconstruction] = []
+    while (path := folder / str(len(models))).is_dir():
+        try:
+            with colmap_log():
+                models.append(pycolmap.Reconstruction(path))
+        except (RuntimeError, ValueError) as error:
+            raise WorkspaceError(
+                f"{path}: is not a readable COLMAP model; try: corrsfm reconstruct --overwrite"
+            ) from error
+    if not models:
+        raise WorkspaceError(f"{folder}: holds no model; try: corrsfm reconstruct")
+    return models
+
+
+def observation_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+    """Reprojection error of every observation of a model.
+
+    Returns
+    -------
+    (O,) float64
+        Distances in pixels between keypoint and projected point, images in order of their names. Infinite
+        for a point behind its camera.
+    """
+    errors = [np.zeros(0)]
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        observed = image.get_observation_points2D()
+        if not observed:
+            continue
+        keypoints = np.array([point.xy for point in observed])
+        points = np.array([model.points3D[point.point3D_id].xyz for point in observed])
+        in_camera = image.cam_from_world() * points
+        projected = np.full_like(keypoints, np.inf)
+        front = in_camera[:, 2] > 0
+        projected[front] = image.camera.img_from_cam(in_camera[front])
+        errors.append(np.linalg.norm(projected - keypoints, axis=1))
+    return np.concatenate(errors)
+
+
+def summarise_model(model: pycolmap.Reconstruction) -> ModelSummary:
+    """A model in numbers."""
+    errors = observation_errors(model)
+    num_images = model.num_reg_images()
+    # Without points all of them are undefined.
+    mean, median, p95 = (
+        (errors.mean(), *np.percentile(errors, [50, 95])) if len(errors) else (np.nan, np.nan, np.nan)
+    )
+    num_observations = model.compute_num_observations()
+    return ModelSummary(
+        image_names=tuple(sorted(image.name for image in model.images.values() if image.has_pose)),
+        num_points=model.num_points3D(),
+        num_observations=num_observations,
+        mean_track_length=num_observations / max(model.num_points3D(), 1),
+        mean_observations_per_image=num_observations / max(num_images, 1),
+        mean_error_px=float(mean),
+        median_error_px=float(median),
+        p95_error_px=float(p95),
+    )

@@ -1,0 +1,261 @@
+"""A verified database → models, by pycolmap's incremental, global or hierarchical mapping."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
+import pycolmap
+
+from corrsfm.colmap import colmap_log, database_errors, summarise_model
+from corrsfm.config import Mapper, ReconstructionConfig
+from corrsfm.errors import DatabaseError, ReconstructionError
+from corrsfm.types import ModelSummary
+from corrsfm.workspace import atomic_path
+
+__all__ = ["reconstruct"]
+
+_POLL_SECONDS = 0.2
+
+
+def reconstruct(
+    database: Path,
+    images_dir: Path | None,
+    output: Path,
+    *,
+    config: ReconstructionConfig,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> list[ModelSummary]:
+    """Map a database into models; they appear at ``output`` all at once or not at all.
+
+    Parameters
+    ----------
+    database : Path
+        With verified two-view geometries; not changed.
+    images_dir : Path or None
+        Folder of the photos, for the colours of the points; without it, or where a photo is missing, points
+        stay black.
+    output : Path
+        Folder of the models ``0``, ``1`` … in COLMAP's binary format, the one with most photos first. An
+        existing folder is replaced.
+    config : ReconstructionConfig
+    seed : int
+        Equal seeds give equal models; with more than one thread and large models up to rounding only.
+    num_threads : int
+        0 for all cores.
+    log_file : Path, optional
+        Where pycolmap's messages are appended.
+    on_progress : callable, optional
+        Called with the number of photos in the model under construction whenever it grows; incremental
+        mapping only. An exception it raises cancels the mapping and is passed on.
+
+    Returns
+    -------
+    list of ModelSummary
+        In the order of the folders.
+
+    Raises
+    ------
+    ReconstructionError
+        If no model came out, with the reason.
+    DatabaseError
+        If there is no such database or it is in use.
+    """
+    if not database.is_file():
+        raise DatabaseError(f"{database}: no such database; try: corrsfm prune WORKSPACE")
+    with atomic_path(output) as temporary, colmap_log(log_file), database_errors(database):
+        graph = _read_pair_graph(database)
+        if not graph.num_inliers:
+            raise ReconstructionError(f"{database}: {_why_no_model(graph)}")
+        scratch = temporary / "mapper"
+        scratch.mkdir(parents=True)
+        pycolmap.set_random_seed(seed)
+        # pycolmap insists on an existing folder even if no photo is read.
+        mapped = _run_mapper(
+            database,
+            images_dir or scratch,
+            scratch,
+            config=config,
+            options=_incremental_options(config, output, seed, num_threads),
+            on_progress=on_progress or (lambda num_registered: None),
+        )
+        models = sorted(
+            (model for model in mapped.values() if model.num_reg_images() > 1),
+            key=lambda model: (-model.num_reg_images(), -model.num_points3D(), _first_name(model)),
+        )
+        if not models:
+            raise ReconstructionError(f"{database}: {_why_no_model(graph)}")
+        for number, model in enumerate(models):
+            if images_dir is not None and config.mapper is not Mapper.INCREMENTAL:
+                model.extract_colors_for_all_images(images_dir)
+            (temporary / str(number)).mkdir()
+            model.write_binary(temporary / str(number))
+        shutil.rmtree(scratch)
+        return [summarise_model(model) for model in models]
+
+
+def _incremental_options(
+    config: ReconstructionConfig, output: Path, seed: int, num_threads: int
+) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    # Verification has decided which pairs are good; a second threshold here could only contradict it.
+    options.min_num_matches = 1
+    options.min_model_size = config.min_model_size
+    options.multiple_models = config.multiple_models
+    options.ba_refine_principal_point = config.refine_principal_point
+    options.num_threads = num_threads or -1
+    options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
+    if config.max_runtime_minutes > 0:
+        options.max_runtime_seconds = max(1, round(60 * config.max_runtime_minutes))
+    if config.snapshot_every:
+        snapshots = output.with_name("snapshots")
+        snapshots.mkdir(parents=True, exist_ok=True)
+        options.snapshot_path = snapshots
+        options.snapshot_frames_freq = config.snapshot_every
+    return options
+
+
+def _run_mapper(
+    database: Path,
+    images_dir: Path,
+    scratch: Path,
+    *,
+    config: ReconstructionConfig,
+    options: pycolmap.IncrementalPipelineOptions,
+    on_progress: Callable[[int], None],
+) -> dict[int, pycolmap.Reconstruction]:
+    if config.mapper is Mapper.INCREMENTAL:
+        return _map_incrementally(database, images_dir, scratch, options, on_progress)
+    if config.mapper is Mapper.GLOBAL:
+        general = pycolmap.GlobalPipelineOptions()
+        general.min_num_matches = options.min_num_matches
+        general.min_model_size = options.min_model_size
+        general.multiple_models = options.multiple_models
+        general.num_threads = general.mapper.num_threads = options.num_threads
+        general.random_seed = general.mapper.random_seed = options.random_seed
+        general.mapper.rotation_averaging.random_seed = options.random_seed
+        general.mapper.global_positioning.random_seed = options.random_seed
+        general.mapper.retriangulation.random_seed = options.random_seed
+        general.mapper.bundle_adjustment.refine_principal_point = config.refine_principal_point
+        return _interruptible(pycolmap.global_mapping, database, images_dir, scratch, general)
+    clusters = pycolmap.HierarchicalPipelineOptions()
+    clusters.num_threads = options.num_threads
+    clusters.incremental_options = options
+    return _interruptible(pycolmap.hierarchical_mapping, database, images_dir, scratch, clusters)
+
+
+def _map_incrementally(
+    database: Path,
+    images_dir: Path,
+    scratch: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    on_progress: Callable[[int], None],
+) -> dict[int, pycolmap.Reconstruction]:
+    num_registered = 0
+
+    def start() -> None:
+        nonlocal num_registered
+        num_registered = 2
+        on_progress(num_registered)
+
+    def grow() -> None:
+        nonlocal num_registered
+        num_registered += 1
+        on_progress(num_registered)
+
+    return pycolmap.incremental_mapping(
+        database,
+        images_dir,
+        scratch,
+        options,
+        initial_image_pair_callback=start,
+        next_image_callback=grow,
+    )
+
+
+def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function that does not look for Ctrl-C, and let Ctrl-C through all the same.
+
+    After an interruption the call goes on in its thread until it is done or the process ends; its result is
+    dropped.
+    """
+    outcome: dict[str, Any] = {}
+
+    def work() -> None:
+        try:
+            outcome["result"] = function(*arguments)
+        except BaseException as error:  # raised again in the thread of the caller
+            outcome["error"] = error
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(_POLL_SECONDS)
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["result"]
+
+
+def _first_name(model: pycolmap.Reconstruction) -> str:
+    return min(image.name for image in model.images.values())
+
+
+@dataclass(frozen=True)
+class _PairGraph:
+    """Counts of the pairs of a database; the dicts map COLMAP's pair ids to numbers above zero."""
+
+    names: dict[int, str]
+    num_recorded: int
+    num_matches: dict[int, int]
+    num_inliers: dict[int, int]
+
+
+def _read_pair_graph(database: Path) -> _PairGraph:
+    with pycolmap.Database.open(database) as tables:
+        inliers = zip(*tables.read_two_view_geometry_num_inliers(), strict=True)
+        return _PairGraph(
+            names={image.image_id: image.name for image in tables.read_all_images()},
+            num_recorded=tables.num_matched_image_pairs(),
+            num_matches=dict(zip(*tables.read_num_matches(), strict=True)),
+            num_inliers={pair: num for pair, num in inliers if num > 0},
+        )
+
+
+def _why_no_model(graph: _PairGraph) -> str:
+    """The reason for an empty result, drawn from the graph of verified pairs."""
+
+    def best(counts: dict[int, int]) -> str:
+        pair = max(counts, key=lambda pair: (counts[pair], -pair))
+        name0, name1 = sorted(graph.names[image] for image in pycolmap.pair_id_to_image_pair(pair))
+        return f"{name0} – {name1} with {counts[pair]}"
+
+    nothing = "no model could be made: "
+    if len(graph.names) < 2:
+        return f"{nothing}at least 2 photos are needed, the number of photos is {len(graph.names)}"
+    if not graph.num_recorded:
+        return f"{nothing}no pair of photos was matched; choose another --pairing"
+    if not graph.num_matches:
+        return (
+            f"{nothing}all {graph.num_recorded} pairs were pruned to nothing; "
+            "try a more lenient prune method such as --method ratio, or photos that overlap more"
+        )
+    if not graph.num_inliers:
+        return (
+            f"{nothing}none of the {graph.num_recorded} pairs passed the verification; most matches has "
+            f"{best(graph.num_matches)}; try photos that overlap more, more features or a lower "
+            "--min-num-inliers"
+        )
+    return (
+        f"{nothing}{len(graph.num_inliers)} of {graph.num_recorded} pairs are verified, the best is "
+        f"{best(graph.num_inliers)} matches, but no two photos make a good start: their matches are too few "
+        "or the camera hardly moved between them; try photos from places further apart, more features or "
+        "--mapper global"
+    )
