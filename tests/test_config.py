@@ -1,0 +1,97 @@
+"""Options: one home for each default, every error named at once, hashes that see what matters."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from corrsfm import config as cfg
+from corrsfm.errors import ConfigError
+
+STAGES = [entry.default_factory for entry in dataclasses.fields(cfg.PipelineConfig)]  # type: ignore[misc]
+
+
+def test_every_option_has_a_help_text() -> None:
+    options = [entry for stage in STAGES for entry in dataclasses.fields(stage)]
+    assert len(options) > 25
+    assert not [
+        entry.name
+        for entry in options
+        if len(entry.metadata["help"]) < 8 or entry.metadata["help"][-1] == "."
+    ]
+
+
+def test_no_two_stages_share_an_option_name() -> None:
+    names = [entry.name for stage in STAGES for entry in dataclasses.fields(stage)]
+    assert len(names) == len(set(names))
+
+
+def test_a_pipeline_file_overrides_only_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text(
+        '[features]\nmax-features = 7\n[pairs]\npairing = ["sequential", "spatial"]\nmax_distance_m = 5\n'
+    )
+    config = cfg.load_pipeline(path)
+    assert config.features == dataclasses.replace(cfg.FeaturesConfig(), max_features=7)
+    assert config.pairs.pairing == (cfg.PairStrategy.SEQUENTIAL, cfg.PairStrategy.SPATIAL)
+    assert config.pairs.max_distance_m == 5.0
+    assert config.prune == cfg.PruneConfig()
+
+
+def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text(
+        '[features]\nmax_features = 0\nsize = 1\n[prune]\nmethod = "magic"\n[colour]\n[run]\nseed = "x"\n'
+    )
+    with pytest.raises(ConfigError) as error:
+        cfg.load_pipeline(path)
+    text = str(error.value)
+    for part in (
+        str(path),
+        "features.max_features is 0, expected at least 1",
+        "unknown key 'features.size', valid are extractor, max_features",
+        "prune.method is 'magic', expected one of none, ratio",
+        "unknown key 'colour', valid are images, features",
+        "run.seed is 'x', expected int",
+    ):
+        assert part in text
+
+
+@pytest.mark.parametrize("text", ["[features", "features = 3", "[features]\nroot_sift = 1"])
+def test_broken_pipeline_files_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="p.toml"):
+        cfg.load_pipeline(path)
+
+
+def test_a_missing_pipeline_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        cfg.load_pipeline(tmp_path / "none.toml")
+
+
+def test_every_bundled_pipeline_file_loads(repository: Path) -> None:
+    files = [
+        path
+        for path in sorted((repository / "pipelines").rglob("*.toml"))
+        if not path.name.startswith("train")
+    ]
+    assert len(files) >= 4
+    for path in files:
+        cfg.load_pipeline(path)
+
+
+def test_hash_changes_with_results_and_not_with_speed() -> None:
+    base = cfg.PruneConfig()
+    assert cfg.config_hash(base) == cfg.config_hash(cfg.PruneConfig())
+    assert cfg.config_hash(base) != cfg.config_hash(dataclasses.replace(base, max_ratio=0.7))
+    assert cfg.config_hash(base) == cfg.config_hash(dataclasses.replace(base, max_batch_matches=99))
+
+
+def test_hash_of_nested_records_is_by_value() -> None:
+    from corrsfm.types import Camera
+
+    camera = Camera(model="PINHOLE", width=4, height=3, params=(1.0, 1.0, 2.0, 1.5))
+    same = Camera(model="PINHOLE", width=4, height=3, params=(1.0, 1.0, 2.0, 1.5))
+    other = dataclasses.replace(camera, width=5)
+    assert cfg.config_hash([camera]) == cfg.config_hash([same]) != cfg.config_hash([other])
