@@ -1,0 +1,208 @@
+"""A reconstruction measured against known cameras."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from corrsfm.errors import InputError
+from corrsfm.evaluation.metrics import Pose, pose_auc, position_errors, relative_pose_errors
+
+__all__ = ["SCENE_THRESHOLDS_DEG", "SceneScore", "evaluate_scene", "find_model", "read_poses", "score_poses"]
+
+SCENE_THRESHOLDS_DEG = (1.0, 5.0, 10.0)
+_MODEL_FILES = ("images.bin", "images.txt")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneScore:
+    """How a reconstruction compares with known cameras.
+
+    Attributes
+    ----------
+    num_photos : int
+        Photos with known cameras.
+    num_registered : int
+        Those of them that the reconstruction holds.
+    auc : dict of str to float
+        Percent, by threshold in degrees: exact AUC of the relative pose over all pairs of photos with known
+        cameras; a pair with an unregistered photo is a failure.
+    median_pair_error_deg : float or None
+        Over the pairs of registered photos.
+    position_error_mean, position_error_median, position_error_max : float or None
+        Distance of camera centres after the best similarity alignment, in units of the known cameras; None
+        with fewer than three registered photos or centres on one line.
+    extent : float
+        Diagonal of the box around the known camera centres, to put the errors in proportion.
+    position_error_percent : float or None
+        Mean position error in percent of the extent.
+    """
+
+    num_photos: int
+    num_registered: int
+    auc: dict[str, float]
+    median_pair_error_deg: float | None
+    position_error_mean: float | None
+    position_error_median: float | None
+    position_error_max: float | None
+    extent: float
+    position_error_percent: float | None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return dataclasses.asdict(self)
+
+
+def find_model(folder: Path) -> Path:
+    """The model in a folder: itself, or the largest one of a workspace (``sparse/0``).
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    for candidate in (folder, folder / "sparse" / "0", folder / "0"):
+        if any((candidate / name).exists() for name in _MODEL_FILES):
+            return candidate
+    raise InputError(
+        f"{folder}: holds no COLMAP model (images.bin or images.txt) and no sparse/0; "
+        f"run: corrsfm reconstruct {folder}"
+    )
+
+
+def read_poses(folder: Path) -> dict[str, Pose]:
+    """Camera poses by photo name.
+
+    Parameters
+    ----------
+    folder : Path
+        A COLMAP model, binary or text, or a folder of camera files: ``PHOTO.json``, the photo's name with its
+        suffix, each an object with ``rotation`` (3 × 3, rows) and ``translation`` (3) of ``cam_from_world``.
+
+    Returns
+    -------
+    dict
+        Name to rotation (3, 3) and translation (3,) of ``cam_from_world``, sorted by name.
+
+    Raises
+    ------
+    InputError
+        If there is neither, or a file is damaged.
+    """
+    if any((folder / name).exists() for name in _MODEL_FILES):
+        return _read_colmap(folder)
+    files = sorted(folder.rglob("*.json")) if folder.is_dir() else []
+    if not files:
+        raise InputError(
+            f"{folder}: no ground truth found; expected a COLMAP model (images.bin or images.txt) or camera "
+            "files PHOTO.json with 'rotation' and 'translation'"
+        )
+    return {path.relative_to(folder).as_posix().removesuffix(".json"): _read_camera(path) for path in files}
+
+
+def _read_colmap(folder: Path) -> dict[str, Pose]:
+    import cv2  # noqa: F401  (must be loaded before pycolmap)
+    import pycolmap
+
+    try:
+        model = pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{folder}: COLMAP model cannot be read ({error})") from error
+    poses = {}
+    for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name):
+        pose = image.cam_from_world()
+        poses[image.name] = (
+            np.asarray(pose.rotation.matrix(), np.float64),
+            np.asarray(pose.translation, np.float64),
+        )
+    return poses
+
+
+def _read_camera(path: Path) -> Pose:
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        rotation = np.array(values["rotation"], np.float64).reshape(3, 3)
+        translation = np.array(values["translation"], np.float64).reshape(3)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: not a camera file ({error!r}); expected 'rotation' (3 × 3) and 'translation' (3) of "
+            "cam_from_world"
+        ) from error
+    if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
+        raise InputError(f"{path}: 'rotation' is no rotation matrix; expected cam_from_world, rows first")
+    return rotation, translation
+
+
+def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneScore:
+    """Score camera poses against known ones; photos that only one of them has are handled as documented."""
+    names = [name for name in sorted(truth) if name in poses]
+    errors = relative_pose_errors(poses, truth)
+    centres = np.array([_centre(truth[name]) for name in sorted(truth)])
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    finite = errors[np.isfinite(errors)]
+    distances = None
+    if len(names) >= 3:
+        try:
+            distances = position_errors(
+                [_centre(poses[name]) for name in names], [_centre(truth[name]) for name in names]
+            )
+        except ValueError:
+            # Centres on one line leave the alignment open; the relative poses still tell.
+            distances = None
+    mean = None if distances is None else float(distances.mean())
+    return SceneScore(
+        num_photos=len(truth),
+        num_registered=len(names),
+        auc={
+            f"{threshold:g}": value
+            for threshold, value in zip(
+                SCENE_THRESHOLDS_DEG, pose_auc(errors, SCENE_THRESHOLDS_DEG), strict=True
+            )
+        },
+        median_pair_error_deg=float(np.median(finite)) if len(finite) else None,
+        position_error_mean=mean,
+        position_error_median=None if distances is None else float(np.median(distances)),
+        position_error_max=None if distances is None else float(distances.max()),
+        extent=extent,
+        position_error_percent=100.0 * mean / extent if mean is not None and extent > 0 else None,
+    )
+
+
+def _centre(pose: Pose) -> np.ndarray:
+    rotation, translation = pose
+    return -rotation.T @ translation
+
+
+def evaluate_scene(model: Path, ground_truth: Path) -> SceneScore:
+    """Measure a reconstruction against known cameras.
+
+    Parameters
+    ----------
+    model : Path
+        A COLMAP model or a workspace; of a workspace the largest model counts.
+    ground_truth : Path
+        See `read_poses`.
+
+    Raises
+    ------
+    InputError
+        If one cannot be read, they share no photo, or fewer than two cameras are known.
+    """
+    truth = read_poses(ground_truth)
+    if len(truth) < 2:
+        raise InputError(
+            f"{ground_truth}: only {len(truth)} known cameras; at least 2 are needed to compare poses"
+        )
+    poses = _read_colmap(find_model(model))
+    if not poses.keys() & truth.keys():
+        raise InputError(
+            f"{model} and {ground_truth} share no photo name (such as '{next(iter(poses), 'none')}' and "
+            f"'{next(iter(truth))}'); names must be paths relative to the same image folder"
+        )
+    return score_poses(poses, truth)
