@@ -110,7 +110,7 @@ def scaled_size(width: int, height: int, max_image_size: int) -> tuple[int, int]
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
-def quantise_descriptors(descriptors: NDArray[np.floating], *, root_sift: bool) -> NDArray[np.uint8]:
+def quantise_descriptors(descriptors: NDArray, *, root_sift: bool) -> NDArray[np.uint8]:
     """Normalise non-negative descriptors and store them as COLMAP does.
 
     Parameters
@@ -163,8 +163,7 @@ def _detect_opencv(
         return np.zeros((0, 4)), np.zeros(0), np.zeros((0, DESCRIPTOR_SIZE), np.uint8)
     scores = np.array([keypoint.response for keypoint in keypoints])
     # OpenCV's own quantisation is COLMAP's.
-    raw = np.asarray(raw, np.float32)
-    descriptors = quantise_descriptors(raw, root_sift=True) if root_sift else raw.astype(np.uint8)
+    descriptors = quantise_descriptors(raw, root_sift=True) if root_sift else np.asarray(raw, np.uint8)
     return _opencv_geometry(keypoints), scores, descriptors
 
 

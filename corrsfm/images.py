@@ -6,58 +6,366 @@ mask and keypoints must speak of the same frame.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import hashlib
+import os
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.types import Camera
+from corrsfm.cameras import (
+    PhotoInfo,
+    assign_cameras,
+    camera_from_pycolmap,
+    normalise_points,
+    to_pycolmap,
+)
+from corrsfm.config import ImagesConfig
+from corrsfm.errors import ImageError, InputError
+from corrsfm.types import Camera, ImageRecord
 
-if TYPE_CHECKING:
-    import pycolmap
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "camera_from_pycolmap",
+    "duplicate_images",
+    "hash_file",
+    "index_images",
+    "list_images",
+    "name_remarks",
+    "normalise_points",
+    "read_image",
+    "read_mask",
+    "read_photo_info",
+    "to_pycolmap",
+]
 
-__all__ = ["camera_from_pycolmap", "normalise_points", "to_pycolmap"]
-
-
-def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
-    """The camera as pycolmap's object; ids are COLMAP's and start at 1."""
-    import pycolmap
-
-    return pycolmap.Camera(
-        camera_id=camera_id,
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-        has_prior_focal_length=camera.has_prior_focal_length,
-    )
-
-
-def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
-    """pycolmap's object as our record; the id is dropped."""
-    return Camera(
-        model=camera.model_name,
-        width=int(camera.width),
-        height=int(camera.height),
-        params=tuple(float(value) for value in camera.params),
-        has_prior_focal_length=bool(camera.has_prior_focal_length),
-    )
+IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+MAX_NAMED = 5
 
 
-def normalise_points(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Undo the full camera model, distortion included.
+def index_images(
+    folder: Path,
+    config: ImagesConfig,
+    *,
+    threads: int = 1,
+    hash_of: Callable[[Path], str] | None = None,
+    info_of: Callable[[Path], PhotoInfo] | None = None,
+) -> tuple[list[ImageRecord], list[Camera]]:
+    """List the photos of a scene and say what is known of each.
 
     Parameters
     ----------
-    camera : Camera
-    points : (N, 2) float
-        Pixels, COLMAP convention.
+    folder : Path
+    config : ImagesConfig
+    threads : int
+        Photos whose headers are read at a time.
+    hash_of, info_of : callable, optional
+        Stand-ins for `hash_file` and `read_photo_info`, for a caller that remembers their results.
 
     Returns
     -------
-    (N, 2) float64
-        Normalised coordinates; NaN where the model has no viewing ray for a pixel.
+    records : list of ImageRecord
+        Sorted by name.
+    cameras : list of Camera
+        In the order of the first photo of each.
+
+    Raises
+    ------
+    ImageError
+        Naming every photo that cannot be read.
+    InputError
+        If there are fewer than two photos, or the list, the masks or the cameras do not fit them.
     """
-    if len(points) == 0:
-        return np.zeros((0, 2))
-    return np.asarray(to_pycolmap(camera).cam_from_img(np.ascontiguousarray(points, np.float64)), np.float64)
+    hash_of = hash_of or hash_file
+    info_of = info_of or read_photo_info
+    names = list_images(folder, image_list=config.image_list)
+
+    def read(name: str) -> tuple[str, PhotoInfo] | ImageError:
+        try:
+            return hash_of(folder / name), info_of(folder / name)
+        except ImageError as error:
+            return error
+
+    with ThreadPoolExecutor(threads) as pool:
+        results = list(pool.map(read, names))
+    unreadable = [str(result) for result in results if isinstance(result, ImageError)]
+    if unreadable:
+        raise ImageError("\n".join(unreadable))
+    found = [result for result in results if not isinstance(result, ImageError)]
+    cameras, camera_ids = assign_cameras(
+        names,
+        [info for _, info in found],
+        mode=config.camera_mode,
+        model=config.camera_model,
+        params=config.camera_params,
+    )
+    masks = _find_masks(config.mask_dir, names)
+    records = [
+        ImageRecord(
+            name=name,
+            camera_id=camera_id,
+            sha256=sha256,
+            mask=mask,
+            mask_sha256=hash_of(config.mask_dir / mask) if config.mask_dir and mask else None,
+            gps=info.gps,
+        )
+        for name, camera_id, (sha256, info), mask in zip(names, camera_ids, found, masks, strict=True)
+    ]
+    return records, cameras
+
+
+def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
+    """Names of the photos in a folder and its sub-folders, sorted.
+
+    Parameters
+    ----------
+    folder : Path
+        Hidden files and folders, and files without one of `IMAGE_SUFFIXES` (in any case), are ignored.
+    image_list : Path, optional
+        Text file with one name per line, relative to the folder; ``#`` starts a comment line. Only these
+        photos are used, whatever their suffix.
+
+    Returns
+    -------
+    list of str
+        Posix paths relative to the folder, at least two.
+
+    Raises
+    ------
+    InputError
+        If the folder or the list cannot be read, the list names photos that do not exist, or fewer than two
+        photos remain.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; expected the folder with the photos")
+    files = _visible_files(folder)
+    if image_list is None:
+        names = [name for name in files if name.lower().endswith(IMAGE_SUFFIXES)]
+        where = str(folder)
+    else:
+        names = _read_image_list(image_list, folder)
+        where = str(image_list)
+    unprintable = [name for name in names if not _is_utf8(name)]
+    if unprintable:
+        raise InputError(f"{folder}: names are not valid UTF-8: {_some(map(repr, unprintable))}; rename them")
+    if len(names) < 2:
+        found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
+        raise InputError(
+            f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
+        )
+    return sorted(names)
+
+
+def _visible_files(folder: Path) -> list[str]:
+    """Posix names of all files that are not hidden; links to folders are followed, but never twice."""
+    names: list[str] = []
+    visited = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(root)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        relative = Path(root).relative_to(folder)
+        names.extend((relative / name).as_posix() for name in files if not name.startswith("."))
+    return sorted(names)
+
+
+def _read_image_list(image_list: Path, folder: Path) -> list[str]:
+    try:
+        lines = image_list.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{image_list}: cannot be read as UTF-8 text ({error})") from error
+    entries = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
+    names = sorted({PurePosixPath(entry).as_posix() for entry in entries})
+    outside = [name for name in names if name.startswith("/") or ".." in PurePosixPath(name).parts]
+    if outside:
+        raise InputError(f"{image_list}: names must be relative to {folder}: {_some(outside)}")
+    missing = [name for name in names if not (folder / name).is_file()]
+    if missing:
+        raise InputError(f"{image_list}: {len(missing)} photos are not in {folder}: {_some(missing)}")
+    return names
+
+
+def name_remarks(names: Sequence[str]) -> list[str]:
+    """What other programs may stumble over in the names of the photos; corrsfm copes with all of it."""
+    remarks = []
+    spaced = [name for name in names if any(character.isspace() for character in name)]
+    if spaced:
+        remarks.append(
+            f"{len(spaced)} names contain spaces, which text files of COLMAP and hloc cannot hold:"
+            f" {_some(spaced)}"
+        )
+    for text, key in (
+        ("hloc writes '/' as '-' and would mix up", lambda name: name.replace("/", "-")),
+        ("file systems that ignore case or accents' encoding would mix up", _folded),
+    ):
+        groups = defaultdict(list)
+        for name in names:
+            groups[key(name)].append(name)
+        remarks.extend(f"{text}: {', '.join(group)}" for group in groups.values() if len(group) > 1)
+    return remarks
+
+
+def hash_file(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file's bytes."""
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def _find_masks(mask_dir: Path | None, names: Sequence[str]) -> list[str | None]:
+    """For each photo ``NAME`` the mask ``NAME.png`` if it exists; photos without one are used whole."""
+    if mask_dir is None:
+        return [None] * len(names)
+    if not mask_dir.is_dir():
+        raise InputError(f"{mask_dir}: no such folder; expected the folder with the masks")
+    masks = [f"{name}.png" if (mask_dir / f"{name}.png").is_file() else None for name in names]
+    if not any(masks):
+        raise InputError(
+            f"{mask_dir}: no mask for any photo; the mask of '{names[0]}' must be '{names[0]}.png'"
+        )
+    return masks
+
+
+def duplicate_images(records: Iterable[ImageRecord]) -> list[tuple[str, ...]]:
+    """Names of photos whose bytes are the same, in groups of at least two, sorted."""
+    groups = defaultdict(list)
+    for record in records:
+        groups[record.sha256].append(record.name)
+    return sorted(tuple(sorted(group)) for group in groups.values() if len(group) > 1)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read a photo as grey values, in the orientation in which it is stored.
+
+    Any depth, palette, colour or alpha is accepted; alpha is dropped. Depths above 8 bits are scaled by the
+    smallest power of two that holds the photo's brightest pixel, since 10- to 14-bit sensor values are
+    commonly stored in 16 bits.
+
+    Returns
+    -------
+    (H, W) uint8
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read or decoded completely.
+    """
+    image = _decode(path, "re-export or remove the photo")
+    if image.dtype == np.uint16:
+        shift = max(0, int(image.max()).bit_length() - 8)
+        image = (image >> shift).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise ImageError(f"{path}: pixels of type {image.dtype}; convert the photo to 8 or 16 bits")
+    return image
+
+
+def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Read a mask.
+
+    Parameters
+    ----------
+    path : Path
+    shape : tuple of int
+        Height and width of the photo.
+
+    Returns
+    -------
+    (H, W) bool
+        False where the photo is to be ignored (the mask is zero).
+
+    Raises
+    ------
+    ImageError
+        If the mask cannot be read or is not as large as the photo.
+    """
+    mask = _decode(path, "re-export or remove the mask")
+    if mask.shape != tuple(shape[:2]):
+        raise ImageError(
+            f"{path}: the mask has {mask.shape[1]}×{mask.shape[0]} pixels, its photo {shape[1]}×{shape[0]} as"
+            " stored (EXIF orientation not applied); re-export the mask in that size"
+        )
+    return mask > 0
+
+
+def _decode(path: Path, advice: str) -> NDArray:
+    """(H, W) grey values in the depth of the file; reads bytes first, for names of any alphabet."""
+    try:
+        content = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+    if len(content) == 0:
+        raise ImageError(f"{path}: the file is empty; {advice}")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(content, flags)
+    except cv2.error as error:
+        raise ImageError(f"{path}: cannot be decoded ({error.err}); {advice}") from error
+    if image is None:
+        raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}")
+    return np.asarray(image)
+
+
+def read_photo_info(path: Path) -> PhotoInfo:
+    """Size, camera and position of a photo.
+
+    Raises
+    ------
+    ImageError
+        If the photo cannot be read.
+    """
+    import pycolmap
+
+    bitmap = pycolmap.Bitmap.read(path, False)
+    if bitmap is None:
+        # A format that pycolmap does not know (WebP) or a file that cannot be read at all.
+        height, width = read_image(path).shape
+        return PhotoInfo(width=width, height=height)
+    latitude, longitude = bitmap.exif_latitude(), bitmap.exif_longitude()
+    gps = None
+    # Receivers without a fix write zeros.
+    if latitude is not None and longitude is not None and (latitude, longitude) != (0.0, 0.0):
+        gps = (float(latitude), float(longitude), float(bitmap.exif_altitude() or 0.0))
+    return PhotoInfo(
+        width=int(bitmap.width),
+        height=int(bitmap.height),
+        camera_name=bitmap.exif_camera_model() or None,
+        focal_px=bitmap.exif_focal_length() or None,
+        gps=gps,
+    )
+
+
+def _some(names: Iterable[str]) -> str:
+    """The first few of many names."""
+    names = list(names)
+    rest = len(names) - MAX_NAMED
+    return ", ".join(names[:MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def _census(files: Sequence[str]) -> str:
+    """What is in a folder instead of photos."""
+    suffixes = Counter(PurePosixPath(name).suffix.lower() or "no suffix" for name in files)
+    if not suffixes:
+        return "no visible files at all"
+    return "only " + ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(MAX_NAMED))
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _is_utf8(name: str) -> bool:
+    try:
+        name.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True

@@ -1,0 +1,196 @@
+"""Cameras: which photos share one, what is known about each, and points normalised by it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.config import CameraMode
+from corrsfm.errors import ConfigError, InputError
+from corrsfm.types import Camera
+
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["PhotoInfo", "assign_cameras", "camera_from_pycolmap", "normalise_points", "to_pycolmap"]
+
+# COLMAP's guess where nothing is known: a field of view of about 45° along the longest side.
+DEFAULT_FOCAL_FACTOR = 1.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoInfo:
+    """What a photo says about its camera.
+
+    Attributes
+    ----------
+    width, height : int
+        Pixels as stored.
+    camera_name : str or None
+        Make, model and focal length setting from EXIF.
+    focal_px : float or None
+        Focal length in pixels from EXIF.
+    gps : tuple of float or None
+        Latitude and longitude in degrees, altitude in metres; 0 if the altitude is not known.
+    """
+
+    width: int
+    height: int
+    camera_name: str | None = None
+    focal_px: float | None = None
+    gps: tuple[float, float, float] | None = None
+
+
+def assign_cameras(
+    names: Sequence[str], infos: Sequence[PhotoInfo], *, mode: CameraMode, model: str, params: str = ""
+) -> tuple[list[Camera], list[int]]:
+    """Decide which photos share a camera, and what is known about each camera.
+
+    Parameters
+    ----------
+    names : sequence of str
+    infos : sequence of PhotoInfo
+        One per name.
+    mode : CameraMode
+        ``auto`` shares a camera among photos of equal size, EXIF camera and focal length, and gives every
+        photo without EXIF its own, as COLMAP does.
+    model : str
+        COLMAP camera model.
+    params : str
+        Known intrinsics, comma-separated in COLMAP's order; empty to take the focal length from EXIF or,
+        failing that, to guess it.
+
+    Returns
+    -------
+    cameras : list of Camera
+        In the order of the first photo of each.
+    camera_ids : list of int
+        Index into the cameras, one per name.
+
+    Raises
+    ------
+    ConfigError
+        If the model is unknown or does not have that many parameters.
+    InputError
+        If photos of one camera differ in size.
+    """
+    values = _parse_params(model, params)
+    keys = [_camera_key(name, info, mode) for name, info in zip(names, infos, strict=True)]
+    first = {key: index for index, key in reversed(list(enumerate(keys)))}
+    for name, info, key in zip(names, infos, keys, strict=True):
+        reference = infos[first[key]]
+        if (info.width, info.height) != (reference.width, reference.height):
+            raise InputError(
+                f"{name}: has {info.width}×{info.height} pixels, but '{names[first[key]]}', which is to share"
+                f" its camera, has {reference.width}×{reference.height}; try --camera-mode auto or remove one"
+            )
+    if values:
+        _check_one_size(names, infos)
+    order = sorted(first, key=lambda key: first[key])
+    cameras = [_make_camera(infos[first[key]], model, values) for key in order]
+    position = {key: index for index, key in enumerate(order)}
+    return cameras, [position[key] for key in keys]
+
+
+def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
+    """Equal for photos that share a camera."""
+    match mode:
+        case CameraMode.SINGLE:
+            return ()
+        case CameraMode.PER_FOLDER:
+            return (PurePosixPath(name).parent.as_posix(),)
+        case CameraMode.AUTO if info.camera_name is not None or info.focal_px is not None:
+            return (info.width, info.height, info.camera_name, info.focal_px)
+    return (name,)
+
+
+def _make_camera(info: PhotoInfo, model: str, values: list[float]) -> Camera:
+    import pycolmap
+
+    focal = info.focal_px or DEFAULT_FOCAL_FACTOR * max(info.width, info.height)
+    camera = pycolmap.Camera.create_from_model_name(1, model, focal, info.width, info.height)
+    if values:
+        camera.params = values
+    camera.has_prior_focal_length = bool(values) or info.focal_px is not None
+    return camera_from_pycolmap(camera)
+
+
+def _parse_params(model: str, params: str) -> list[float]:
+    """The known intrinsics as numbers; checks the model on the way."""
+    import pycolmap
+
+    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if model not in known:
+        raise ConfigError(f"camera_model is '{model}', expected one of {', '.join(known)}")
+    if not params.strip():
+        return []
+    expected = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params_info
+    try:
+        values = [float(value) for value in params.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(expected.split(",")) or not np.isfinite(values).all():
+        raise ConfigError(f"camera_params is '{params}', expected the numbers {expected} for {model}")
+    return values
+
+
+def _check_one_size(names: Sequence[str], infos: Sequence[PhotoInfo]) -> None:
+    sizes = Counter((info.width, info.height) for info in infos)
+    (width, height), _ = sizes.most_common(1)[0]
+    others = [n for n, i in zip(names, infos, strict=True) if (i.width, i.height) != (width, height)]
+    if others:
+        raise InputError(
+            f"known camera_params fit photos of one size, but beside {width}×{height} pixels there are"
+            f" {len(others)} of other sizes, such as '{others[0]}'; leave these out or drop camera_params"
+        )
+
+
+def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
+    """The camera as pycolmap's object; ids are COLMAP's and start at 1."""
+    import pycolmap
+
+    return pycolmap.Camera(
+        camera_id=camera_id,
+        model=camera.model,
+        width=camera.width,
+        height=camera.height,
+        params=list(camera.params),
+        has_prior_focal_length=camera.has_prior_focal_length,
+    )
+
+
+def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
+    """pycolmap's object as our record; the id is dropped."""
+    return Camera(
+        model=camera.model_name,
+        width=int(camera.width),
+        height=int(camera.height),
+        params=tuple(float(value) for value in camera.params),
+        has_prior_focal_length=bool(camera.has_prior_focal_length),
+    )
+
+
+def normalise_points(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Undo the full camera model, distortion included.
+
+    Parameters
+    ----------
+    camera : Camera
+    points : (N, 2) float
+        Pixels, COLMAP convention.
+
+    Returns
+    -------
+    (N, 2) float64
+        Normalised coordinates; NaN where the model has no viewing ray for a pixel.
+    """
+    if len(points) == 0:
+        return np.zeros((0, 2))
+    pixels = np.ascontiguousarray(points, np.float64)
+    return np.asarray(to_pycolmap(camera).cam_from_img(pixels), np.float64)
