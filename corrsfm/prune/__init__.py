@@ -93,12 +93,28 @@ def build_pruner(
         return KeepAll()
     if config.method is PruneMethod.RATIO:
         return RatioPruner(config.max_ratio)
+    if config.method is PruneMethod.CORRADAPTOR:
+        return _load_network_pruner(config, device)
     return EstimatorPruner(
         str(config.method),
         max_ratio=config.max_ratio,
         max_error_px=config.max_error_px,
         seed=seed,
         threads=threads,
+    )
+
+
+def _load_network_pruner(config: PruneConfig, device: str) -> Pruner:
+    # Here, not above: it loads torch.
+    from corrsfm.prune.learned import Pruner
+
+    return Pruner.load(
+        config.model,
+        device=device,
+        operating_point=config.operating_point,
+        max_candidates=config.max_candidates,
+        max_batch_matches=config.max_batch_matches,
+        precision=config.precision,
     )
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.cameras import normalise_points
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
 __all__ = ["SIDE_CHANNELS", "make_correspondences", "side_information"]
@@ -40,9 +41,6 @@ def make_correspondences(
     Correspondences
         In the order of ``matches``.
     """
-    # Here, not above: it loads OpenCV, and training and the command line import this module.
-    from corrsfm.images import normalise_points
-
     index0, index1 = matches.indices[:, 0], matches.indices[:, 1]
     points0, points1 = features0.keypoints[index0], features1.keypoints[index1]
     rotations = features1.orientations[index1] - features0.orientations[index0]

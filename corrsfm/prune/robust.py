@@ -6,18 +6,20 @@ guess would be forced onto the estimate, so a fundamental matrix is estimated in
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
-import cv2  # before pycolmap: the other order aborts the process on the first PNG
+import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.cameras import to_pycolmap
+from corrsfm.colmap import colmap_log
 from corrsfm.geometry import symmetric_epipolar_distance_sq
 from corrsfm.types import Camera, Correspondences, TwoViewModel
 
@@ -52,16 +54,6 @@ class TwoViewEstimate:
 
     model: TwoViewModel | None
     inlier_mask: NDArray[np.bool_]
-
-
-def _pycolmap_camera(camera: Camera) -> pycolmap.Camera:
-    return pycolmap.Camera(
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-        has_prior_focal_length=camera.has_prior_focal_length,
-    )
 
 
 def _usable(pair: Correspondences, candidates: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -112,7 +104,7 @@ def lo_ransac(
     with tempfile.TemporaryDirectory(prefix="corrsfm-") as folder:
         path = Path(folder) / "verify.db"
         _write_pairs(path, [(pairs[index], rows[index]) for index in todo])
-        with _quiet_colmap():
+        with colmap_log():
             pycolmap.geometric_verification(
                 path,
                 pycolmap.GeometricVerifierOptions(num_threads=threads if threads > 0 else -1),
@@ -143,9 +135,7 @@ def _write_pairs(path: Path, pairs: Sequence[tuple[Correspondences, NDArray[np.i
                 (2, pair.camera1, pair.points1[rows]),
             ):
                 number = 2 * position + side
-                entry = _pycolmap_camera(camera)
-                entry.camera_id = number
-                database.write_camera(entry, use_camera_id=True)
+                database.write_camera(to_pycolmap(camera, number), use_camera_id=True)
                 image = pycolmap.Image(name=str(number), camera_id=number)
                 image.image_id = number
                 database.write_image(image, use_image_id=True)
@@ -165,17 +155,6 @@ def _from_colmap(geometry: pycolmap.TwoViewGeometry, rows: NDArray[np.intp], num
         elif geometry.F is not None:
             model = TwoViewModel(kind="fundamental", matrix=np.array(geometry.F, np.float64))
     return TwoViewEstimate(model=model, inlier_mask=mask)
-
-
-@contextlib.contextmanager
-def _quiet_colmap() -> Iterator[None]:
-    """Silence COLMAP's progress lines about the temporary database."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, 1)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 # ------------------------------------------------------------------------------------------------- MAGSAC++
@@ -234,21 +213,20 @@ def _magsac_pair(
     inlier_mask[rows[np.asarray(mask).ravel().astype(bool)]] = True
     if np.count_nonzero(inlier_mask) < MIN_NUM_INLIERS:
         return TwoViewEstimate(model=None, inlier_mask=np.zeros(len(pair), bool))
-    kind = "essential" if calibrated else "fundamental"
-    return TwoViewEstimate(
-        model=TwoViewModel(kind=kind, matrix=matrix.astype(float)), inlier_mask=inlier_mask
-    )
+    kind: Literal["essential", "fundamental"] = "essential" if calibrated else "fundamental"
+    model = TwoViewModel(kind=kind, matrix=np.asarray(matrix, np.float64))
+    return TwoViewEstimate(model=model, inlier_mask=inlier_mask)
 
 
 # --------------------------------------------------------------------------------------- comparing models
 
 
 def _calibration_matrix(camera: Camera) -> NDArray[np.float64]:
-    return np.asarray(_pycolmap_camera(camera).calibration_matrix(), np.float64)
+    return np.asarray(to_pycolmap(camera).calibration_matrix(), np.float64)
 
 
 def _mean_focal_length_px(pair: Correspondences) -> float:
-    focal_lengths = [_pycolmap_camera(camera).mean_focal_length() for camera in (pair.camera0, pair.camera1)]
+    focal_lengths = [to_pycolmap(camera).mean_focal_length() for camera in (pair.camera0, pair.camera1)]
     return float(np.mean(focal_lengths))
 
 

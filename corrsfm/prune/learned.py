@@ -1,0 +1,388 @@
+"""Prune method ``corradaptor``: numpy in, numpy out around the network; owns device, batches and memory.
+
+The only inference module that touches a device.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from corrsfm.config import OperatingPoint, Precision
+from corrsfm.errors import ConfigError, CorrsfmError
+from corrsfm.model import CorrAdaptor, load_network, weights
+from corrsfm.prune.correspondences import side_information
+from corrsfm.prune.robust import normalised_residuals
+from corrsfm.types import Correspondences, PruneResult, TwoViewModel
+
+__all__ = [
+    "Pruner",
+    "choose_device",
+    "choose_precision",
+    "pack_batches",
+    "select_candidates",
+    "select_kept",
+]
+
+logger = logging.getLogger(__name__)
+
+# The weighted eight-point algorithm sees what two prunings leave; of fewer it makes an arbitrary matrix.
+_MIN_NUM_FOR_MATRIX = 8
+
+# Squared symmetric epipolar distances in normalised units, see `select_kept`.
+POSE_MAX_RESIDUAL = 3e-5
+SFM_MAX_RESIDUAL = 1e-4
+SFM_MIN_KEPT = 30
+
+# The guard speaks only about pairs that can show what they are.
+_GUARD_MIN_MATCHES = 50
+_GUARD_RATIO = 0.8
+_GUARD_MIN_SHARE = 0.1
+
+
+class NetworkEstimate(NamedTuple):
+    """What the network says about one pair."""
+
+    logits: NDArray[np.float32]
+    """(M,) last logit of every match, −inf for those that the network did not see."""
+    essential: NDArray[np.float64] | None
+    """(3, 3) acts on normalised coordinates; None if too few matches were left to determine it."""
+
+
+def choose_device(name: str) -> torch.device:
+    """The device that an option names.
+
+    Parameters
+    ----------
+    name : str
+        auto (CUDA if there is one, else CPU), cpu, cuda or cuda:N.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such device.
+    """
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(f"unknown device '{name}'; try auto, cpu, cuda or cuda:0") from error
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise ConfigError(
+            f"device '{name}': torch {torch.__version__} sees no such GPU here; try --device cpu"
+        )
+    return device
+
+
+def choose_precision(precision: Precision, device: torch.device) -> torch.dtype:
+    """Number format to compute in; ``auto`` is bfloat16 only where the processor multiplies it natively."""
+    if precision is not Precision.AUTO:
+        return torch.bfloat16 if precision is Precision.BFLOAT16 else torch.float32
+    if device.type == "cuda":
+        native = torch.cuda.get_device_capability(device)[0] >= 8
+    else:
+        # Older releases know fewer of these questions; not being able to ask means float32.
+        native = any(
+            getattr(torch.cpu, question, bool)()
+            for question in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
+        )
+    return torch.bfloat16 if native else torch.float32
+
+
+def select_candidates(pair: Correspondences, max_candidates: int) -> NDArray[np.intp]:
+    """The matches that the network sees.
+
+    Parameters
+    ----------
+    pair : Correspondences
+    max_candidates : int
+
+    Returns
+    -------
+    (K,) int
+        Increasing indices of the at most ``max_candidates`` finite matches of smallest ratio; among equal
+        ratios the first ones.
+    """
+    usable = np.flatnonzero(np.isfinite(pair.normalised).all(axis=1))
+    if len(usable) <= max_candidates:
+        return usable
+    order = np.argsort(np.nan_to_num(pair.ratios[usable], nan=np.inf), kind="stable")
+    return np.sort(usable[order[:max_candidates]])
+
+
+def pack_batches(sizes: Sequence[int], max_batch_matches: int) -> list[list[int]]:
+    """Group pairs so that little of a batch is padding and none is too large.
+
+    Parameters
+    ----------
+    sizes : sequence of int
+        Matches of each pair.
+    max_batch_matches : int
+        Bound of pairs × largest size in a batch; a pair that exceeds it alone is a batch of its own.
+
+    Returns
+    -------
+    list of list of int
+        Positions in ``sizes``, largest first; each occurs once.
+    """
+    batches: list[list[int]] = []
+    # Largest first: what does not fit into memory fails at the start, not after hours.
+    for index in sorted(range(len(sizes)), key=lambda position: -sizes[position]):
+        if batches and (len(batches[-1]) + 1) * sizes[batches[-1][0]] <= max_batch_matches:
+            batches[-1].append(index)
+        else:
+            batches.append([index])
+    return batches
+
+
+def select_kept(
+    pair: Correspondences,
+    scores: NDArray[np.float32],
+    residuals: NDArray[np.float32],
+    operating_point: OperatingPoint,
+) -> NDArray[np.bool_]:
+    """The matches to keep at an operating point.
+
+    Parameters
+    ----------
+    pair : Correspondences
+    scores : (M,) float32
+        Confidence of the network in each match, in [0, 1].
+    residuals : (M,) float32
+        Squared symmetric epipolar distances to the network's essential matrix, normalised units.
+    operating_point : OperatingPoint
+        ``pose``: residual below 3e-5, the published threshold for two-view poses. ``sfm``: mutual matches
+        with a residual below 1e-4, and the best-scored mutual matches up to 30 kept ones, so that
+        verification has something to judge where the network's matrix is poor.
+
+    Returns
+    -------
+    (M,) bool
+    """
+    if operating_point is OperatingPoint.POSE:
+        return residuals < POSE_MAX_RESIDUAL
+    kept = pair.mutual & (residuals < SFM_MAX_RESIDUAL)
+    missing = SFM_MIN_KEPT - int(np.count_nonzero(kept))
+    if missing > 0:
+        others = np.flatnonzero(pair.mutual & ~kept & (scores > 0))
+        kept[others[np.argsort(-scores[others], kind="stable")[:missing]]] = True
+    return kept
+
+
+class Pruner:
+    """Prunes pairs of any sizes with a network.
+
+    Parameters
+    ----------
+    network : CorrAdaptor
+        Is moved to the device and put into evaluation mode.
+    checkpoint_sha256 : str
+        Where the network's weights come from, for `fingerprint`.
+    device : str
+        auto, cpu, cuda or cuda:N.
+    operating_point : OperatingPoint
+        See `select_kept`.
+    max_candidates : int
+        Matches of a pair that the network sees, smallest ratio first. Its essential matrix is verified on
+        all putative matches.
+    max_batch_matches : int
+        Bound of the matches in a batch, padding included; bounds memory.
+    precision : Precision
+    compile : bool
+        Compile the network; pays off on a GPU for many pairs.
+    """
+
+    name = "corradaptor"
+
+    def __init__(
+        self,
+        network: CorrAdaptor,
+        *,
+        checkpoint_sha256: str = "in memory",
+        device: str = "auto",
+        operating_point: OperatingPoint = OperatingPoint.SFM,
+        max_candidates: int = 2000,
+        max_batch_matches: int = 16_000,
+        precision: Precision = Precision.AUTO,
+        compile: bool = False,
+    ) -> None:
+        self.device = choose_device(device)
+        self.dtype = choose_precision(precision, self.device)
+        self._side_channels = network.side_channels
+        self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
+        self._network: Callable = network.to(self.device).eval()
+        if compile:
+            self._network = torch.compile(network, dynamic=True)
+        self._operating_point = operating_point
+        self._max_candidates = max_candidates
+        self._max_batch_matches = max_batch_matches
+        self._warned = False
+        self.fingerprint = (
+            f"corradaptor sha256={checkpoint_sha256} operating_point={operating_point} "
+            f"max_candidates={max_candidates} dtype={self.dtype}"
+        )
+
+    @classmethod
+    def load(cls, path: Path | None = None, device: str = "auto", **options: Any) -> Pruner:
+        """A pruner with the network of a checkpoint.
+
+        Parameters
+        ----------
+        path : Path, optional
+            Checkpoint in this project's or the published format; the bundled one if not given.
+        device : str
+            auto, cpu, cuda or cuda:N.
+        **options
+            As for the class.
+
+        Raises
+        ------
+        CheckpointError
+            If there is no usable checkpoint.
+        """
+        network = load_network(path)
+        return cls(network, checkpoint_sha256=_sha256_of(path), device=device, **options)
+
+    def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
+        """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
+
+        Scores are the network's probabilities that a match is right, from the last round that judged it; a
+        match that the network did not see has the score 0.5 · exp(−residual / 1e-4). Pairs with fewer than
+        32 matches (for the published pruning ratio) get scores but no model.
+        """
+        self._guard(pairs)
+        candidates = [select_candidates(pair, self._max_candidates) for pair in pairs]
+        estimates = self._estimate(pairs, candidates)
+        return [self._result(pair, estimate) for pair, estimate in zip(pairs, estimates, strict=True)]
+
+    def _result(self, pair: Correspondences, estimate: NetworkEstimate) -> PruneResult:
+        model, residuals = None, np.full(len(pair), np.inf, np.float32)
+        if estimate.essential is not None:
+            model = TwoViewModel(kind="essential", matrix=estimate.essential)
+            residuals = normalised_residuals(model, pair)
+        unseen = np.isneginf(estimate.logits)
+        with np.errstate(over="ignore"):  # of exp(∞) and exp(−∞), whose limits are right
+            probabilities = 1.0 / (1.0 + np.exp(-estimate.logits))
+        scores = np.where(unseen, 0.5 * np.exp(-residuals / SFM_MAX_RESIDUAL), probabilities)
+        scores = scores.astype(np.float32)
+        return PruneResult(
+            scores=scores,
+            inlier_mask=select_kept(pair, scores, residuals, self._operating_point),
+            model=model,
+            residuals=residuals if model is not None else np.full(len(pair), np.nan, np.float32),
+            decided_by=self.name,
+        )
+
+    def _estimate(
+        self, pairs: Sequence[Correspondences], candidates: Sequence[NDArray[np.intp]]
+    ) -> list[NetworkEstimate]:
+        """Network outputs of pairs, which run in batches of similar size."""
+        estimates = [
+            NetworkEstimate(logits=np.full(len(pair), -np.inf, np.float32), essential=None) for pair in pairs
+        ]
+        todo = [index for index, rows in enumerate(candidates) if len(rows)]
+        for batch in pack_batches([len(candidates[index]) for index in todo], self._max_batch_matches):
+            members = [todo[position] for position in batch]
+            outputs = self._run([(pairs[index], candidates[index]) for index in members])
+            for index, estimate in zip(members, outputs, strict=True):
+                estimates[index] = estimate
+        return estimates
+
+    def _run(self, items: Sequence[tuple[Correspondences, NDArray[np.intp]]]) -> Iterator[NetworkEstimate]:
+        """Run a batch; when memory runs out, its halves."""
+        try:
+            yield from self._forward(items)
+            return
+        except RuntimeError as error:
+            if not _is_out_of_memory(error):
+                raise
+            if len(items) == 1:
+                pair, rows = items[0]
+                raise CorrsfmError(
+                    f"{pair.name}: {len(rows)} matches do not fit into the memory of {self.device}; "
+                    "try a smaller --max-candidates, or --device cpu"
+                ) from error
+        if self.device.type == "cuda":
+            torch.cuda.empty_cache()
+        half = len(items) // 2
+        logger.info("out of memory: a batch of %d pairs is halved", len(items))
+        yield from self._run(items[:half])
+        yield from self._run(items[half:])
+
+    def _forward(self, items: Sequence[tuple[Correspondences, NDArray[np.intp]]]) -> list[NetworkEstimate]:
+        longest = max(len(rows) for _, rows in items)
+        coordinates = np.zeros((len(items), longest, 4), np.float32)
+        side = np.zeros((len(items), longest, self._side_channels), np.float32)
+        mask = np.zeros((len(items), longest), bool)
+        for index, (pair, rows) in enumerate(items):
+            coordinates[index, : len(rows)] = pair.normalised[rows]
+            side[index, : len(rows)] = side_information(pair, self._side_channels)[rows]
+            mask[index, : len(rows)] = True
+        with (
+            torch.inference_mode(),
+            torch.autocast(self.device.type, torch.bfloat16, enabled=self.dtype is torch.bfloat16),
+        ):
+            output = self._network(
+                torch.from_numpy(coordinates).to(self.device),
+                torch.from_numpy(side).to(self.device) if self._side_channels else None,
+                None if mask.all() else torch.from_numpy(mask).to(self.device),
+            )
+            logits = torch.full(coordinates.shape[:2], -torch.inf, device=self.device)
+            for values, indices in zip(output.logits, output.indices, strict=True):
+                # Later sets judge fewer matches; padding says minus infinity and must not overwrite.
+                earlier = logits.gather(1, indices)
+                logits.scatter_(1, indices, torch.where(values.isneginf(), earlier, values.float()))
+        all_logits = logits.cpu().numpy()
+        essentials = output.essential.double().cpu().numpy()
+        estimates = []
+        for index, (pair, rows) in enumerate(items):
+            full = np.full(len(pair), -np.inf, np.float32)
+            full[rows] = all_logits[index, : len(rows)]
+            determined = len(rows) >= self._min_matches
+            estimates.append(
+                NetworkEstimate(logits=full, essential=essentials[index] if determined else None)
+            )
+        return estimates
+
+    def _guard(self, pairs: Sequence[Correspondences]) -> None:
+        """Warn once if the matches are not the raw nearest neighbours that networks are trained on."""
+        if self._warned:
+            return
+        for pair in pairs:
+            if len(pair) < _GUARD_MIN_MATCHES:
+                continue
+            share = float(np.mean(pair.ratios > _GUARD_RATIO))
+            if share < _GUARD_MIN_SHARE or pair.mutual.all():
+                self._warned = True
+                logger.warning(
+                    "%s: these matches look filtered already (%.0f %% have a ratio over %.1f, %.0f %% are "
+                    "mutual); the network is trained on all nearest neighbours and may do harm here; "
+                    "try --method loransac",
+                    pair.name,
+                    100 * share,
+                    _GUARD_RATIO,
+                    100 * float(np.mean(pair.mutual)),
+                )
+                return
+
+
+def _sha256_of(path: Path | None) -> str:
+    """Hash of a checkpoint that could be loaded."""
+    bundled = weights.REGISTRY.get(str(weights.DEFAULT_CHECKPOINT if path is None else path))
+    if bundled is not None:
+        return bundled.sha256
+    return hashlib.sha256(Path(str(path)).read_bytes()).hexdigest()
+
+
+def _is_out_of_memory(error: RuntimeError) -> bool:
+    # The CPU allocator has no error class of its own.
+    return isinstance(error, torch.OutOfMemoryError) or "can't allocate memory" in str(error)

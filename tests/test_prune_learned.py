@@ -1,0 +1,247 @@
+import dataclasses
+import logging
+
+import numpy as np
+import pytest
+import torch
+from two_view_pairs import make_pair
+
+from corrsfm.config import OperatingPoint, Precision, PruneConfig, PruneMethod
+from corrsfm.errors import CheckpointError, ConfigError, CorrsfmError
+from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
+from corrsfm.prune import Pruner, build_pruner
+from corrsfm.prune.learned import (
+    choose_device,
+    choose_precision,
+    pack_batches,
+    select_candidates,
+    select_kept,
+)
+
+SMALL = NetworkConfig(
+    channels=16, clusters=12, neighbors=(6, 3), fusion_rounds=1, motion_stacking=1, heads=2, side_channels=2
+)
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    network = CorrAdaptor.from_config(SMALL)
+    # Fresh layer scales of 1e-5 would hide mistakes in what they scale.
+    with torch.no_grad():
+        for name, value in network.named_parameters():
+            if name.endswith("layer_scale"):
+                value.fill_(0.5)
+    return network.eval()
+
+
+def make(seed=0, num=120, inlier_ratio=0.5):
+    return make_pair(seed=seed, num=num, inlier_ratio=inlier_ratio, noise_px=0.5).as_correspondences()
+
+
+def pruner_of(network, **options):
+    return Pruner(network, device="cpu", **{"precision": Precision.FLOAT32, **options})
+
+
+def assert_equal_results(results, others):
+    for result, other in zip(results, others, strict=True):
+        np.testing.assert_allclose(result.scores, other.scores, atol=1e-4)
+        np.testing.assert_array_equal(result.inlier_mask, other.inlier_mask)
+        if result.model is None:
+            assert other.model is None
+            continue
+        sign = np.sign(np.sum(result.model.matrix * other.model.matrix))
+        np.testing.assert_allclose(result.model.matrix, sign * other.model.matrix, atol=1e-4)
+
+
+@pytest.mark.parametrize("point", list(OperatingPoint))
+def test_batches_of_mixed_sizes_equal_one_by_one(network, point):
+    pairs = [make(seed, num) for seed, num in enumerate([60, 0, 200, 8, 60, 1, 133, 32])]
+    pruner = pruner_of(network, operating_point=point)
+    together = pruner(pairs)
+    assert_equal_results(together, [pruner([pair])[0] for pair in pairs])
+    assert [result.model is None for result in together] == [len(pair) < 32 for pair in pairs]
+
+
+def test_small_batches_equal_large_ones(network):
+    pairs = [make(seed, 40 + 10 * seed) for seed in range(6)]
+    assert_equal_results(
+        pruner_of(network, max_batch_matches=100)(pairs), pruner_of(network, max_batch_matches=10_000)(pairs)
+    )
+
+
+def test_pack_batches_covers_all_and_bounds_memory():
+    sizes = [5, 100, 7, 50, 0, 49, 300]
+    batches = pack_batches(sizes, 120)
+    assert sorted(index for batch in batches for index in batch) == list(range(7))
+    assert batches[0] == [6]
+    assert all(len(b) == 1 or len(b) * max(sizes[i] for i in b) <= 120 for b in batches)
+    assert [3, 5] in batches
+    assert pack_batches([], 120) == []
+
+
+class OutOfMemory:
+    """A network that refuses batches of more than two pairs."""
+
+    def __init__(self, network, limit=2):
+        self.network, self.limit, self.batches = network, limit, []
+
+    def __call__(self, coordinates, side, mask):
+        self.batches.append(len(coordinates))
+        if len(coordinates) > self.limit:
+            raise torch.OutOfMemoryError("CUDA out of memory")
+        return self.network(coordinates, side, mask)
+
+
+def test_out_of_memory_halves_the_batch_and_goes_on(network, monkeypatch):
+    pairs = [make(seed, 50 + seed) for seed in range(5)]
+    pruner = pruner_of(network)
+    expected = pruner(pairs)
+    small = OutOfMemory(network)
+    monkeypatch.setattr(pruner, "_network", small)
+    assert_equal_results(pruner(pairs), expected)
+    assert small.batches == [5, 2, 3, 1, 2]
+
+
+def test_pair_that_never_fits_is_an_error_that_says_what_to_try(network, monkeypatch):
+    pruner = pruner_of(network)
+    monkeypatch.setattr(pruner, "_network", OutOfMemory(network, limit=0))
+    with pytest.raises(CorrsfmError, match="60 matches do not fit.*--max-candidates"):
+        pruner([make(num=60)])
+
+
+def test_other_errors_of_the_network_are_not_swallowed(network, monkeypatch):
+    pruner = pruner_of(network)
+
+    def broken(*_):
+        raise RuntimeError("shape mismatch")
+
+    monkeypatch.setattr(pruner, "_network", broken)
+    with pytest.raises(RuntimeError, match="shape mismatch"):
+        pruner([make(), make(1)])
+
+
+def test_candidates_are_the_finite_matches_of_best_ratio_in_order():
+    pair = make(num=6)
+    normalised = pair.normalised.copy()
+    normalised[1, 0] = np.nan
+    ratios = np.array([0.9, 0.1, 0.5, np.nan, 0.5, 0.2], np.float32)
+    pair = dataclasses.replace(pair, normalised=normalised, ratios=ratios)
+    assert select_candidates(pair, 6).tolist() == [0, 2, 3, 4, 5]
+    assert select_candidates(pair, 3).tolist() == [2, 4, 5]
+    assert select_candidates(pair, 2).tolist() == [2, 5]
+
+
+def test_matches_beyond_the_candidates_are_judged_by_the_same_matrix(network):
+    pair = make(num=300, inlier_ratio=0.7)
+    (result,) = pruner_of(network, max_candidates=100)([pair])
+    assert len(result) == 300
+    assert np.isfinite(result.residuals).all()
+    rows = select_candidates(pair, 100)
+    few = dataclasses.replace(
+        pair,
+        **{
+            name: getattr(pair, name)[rows]
+            for name in ("points0", "points1", "normalised", "ratios", "mutual")
+        },
+        log_scale_ratios=pair.log_scale_ratios[rows],
+        rotations=pair.rotations[rows],
+    )
+    (alone,) = pruner_of(network)([few])
+    np.testing.assert_allclose(alone.scores, result.scores[rows], atol=1e-4)
+    np.testing.assert_allclose(alone.residuals, result.residuals[rows], rtol=1e-2, atol=1e-7)
+
+
+def test_operating_points_keep_what_they_promise():
+    pair = make(num=100, inlier_ratio=1.0)
+    pair = dataclasses.replace(pair, mutual=np.arange(100) % 2 == 0)
+    residuals = np.full(100, 1e-3, np.float32)
+    residuals[:40], residuals[40:60] = 1e-5, 5e-5
+    scores = np.linspace(0.1, 0.9, 100).astype(np.float32)
+    pose = select_kept(pair, scores, residuals, OperatingPoint.POSE)
+    assert np.flatnonzero(pose).tolist() == list(range(40))
+    sfm = select_kept(pair, scores, residuals, OperatingPoint.SFM)
+    assert np.flatnonzero(sfm).tolist() == list(range(0, 60, 2))
+    residuals[:] = 1.0
+    fallback = select_kept(pair, scores, residuals, OperatingPoint.SFM)
+    assert np.flatnonzero(fallback).tolist() == list(range(40, 100, 2))
+
+
+@pytest.mark.parametrize("num", [0, 1, 8, 10, 40])
+@pytest.mark.parametrize("case", ["plain", "one point", "line", "no motion", "not finite", "huge"])
+def test_degenerate_matches_give_finite_scores(network, num, case):
+    pair = make(num=num)
+    normalised = pair.normalised.copy()
+    if case == "one point":
+        normalised[:] = 0.25
+    elif case == "line":
+        normalised[:, 1] = normalised[:, 3] = 0
+    elif case == "no motion":
+        normalised[:, 2:] = normalised[:, :2]
+    elif case == "not finite":
+        normalised[::2] = np.nan
+        normalised[1::2, 2] = np.inf
+    elif case == "huge":
+        normalised *= np.float32(1e30)
+    pair = dataclasses.replace(pair, normalised=normalised)
+    (result,) = pruner_of(network)([pair])
+    assert len(result) == num
+    assert np.isfinite(result.scores).all()
+    assert ((result.scores >= 0) & (result.scores <= 1)).all()
+    assert result.model is None or np.isfinite(result.model.matrix).all()
+    assert not np.isnan(result.residuals).any() or result.model is None
+
+
+def test_filtered_matches_are_warned_about_once(network, caplog):
+    filtered = dataclasses.replace(make(num=100), ratios=np.full(100, 0.5, np.float32), name="a – b")
+    pruner = pruner_of(network)
+    with caplog.at_level(logging.WARNING):
+        pruner([make(num=100, inlier_ratio=0.3)])
+        assert caplog.text == ""
+        pruner([filtered])
+        pruner([filtered])
+    assert len(caplog.records) == 1
+    assert "a – b" in caplog.text and "loransac" in caplog.text
+
+
+def test_bfloat16_stays_close_to_float32(network):
+    pairs = [make(seed, 150) for seed in range(2)]
+    for exact, rounded in zip(
+        pruner_of(network)(pairs), pruner_of(network, precision=Precision.BFLOAT16)(pairs), strict=True
+    ):
+        assert np.abs(exact.scores - rounded.scores).mean() < 0.02
+
+
+def test_auto_precision_never_chooses_emulation(monkeypatch):
+    device = torch.device("cpu")
+    for question in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
+        monkeypatch.setattr(torch.cpu, question, lambda: False, raising=False)
+    assert choose_precision(Precision.AUTO, device) is torch.float32
+    assert choose_precision(Precision.BFLOAT16, device) is torch.bfloat16
+    monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
+    assert choose_precision(Precision.AUTO, device) is torch.bfloat16
+
+
+def test_unknown_device_is_an_error():
+    with pytest.raises(ConfigError, match="unknown device 'tpu9x'"):
+        choose_device("tpu9x")
+    if not torch.cuda.is_available():
+        with pytest.raises(ConfigError, match="no such GPU"):
+            choose_device("cuda:0")
+        assert choose_device("auto") == torch.device("cpu")
+
+
+def test_checkpoint_is_loaded_by_the_builder_and_named_in_the_fingerprint(network, tmp_path):
+    path = tmp_path / "small.pt"
+    digest = save_network(network, path)
+    config = PruneConfig(method=PruneMethod.CORRADAPTOR, model=path, precision=Precision.FLOAT32)
+    pruner = build_pruner(config, device="cpu")
+    assert pruner.name == "corradaptor"
+    assert digest in pruner.fingerprint
+    pairs = [make(seed) for seed in range(2)]
+    assert_equal_results(pruner(pairs), pruner_of(network)(pairs))
+
+
+def test_missing_checkpoint_is_an_error_that_names_it(tmp_path):
+    with pytest.raises(CheckpointError, match="nowhere.pt"):
+        Pruner.load(tmp_path / "nowhere.pt", device="cpu")
