@@ -1,0 +1,184 @@
+"""The statistics of a scene."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+
+from corrsfm.report import MissingReason, SceneReport, format_table, make_report
+from corrsfm.types import ModelSummary, PairStatistics
+
+
+def pair(name0: str, name1: str, putative: int, pruned: int, verified: int) -> PairStatistics:
+    return PairStatistics(
+        name0=name0, name1=name1, num_putative=putative, num_pruned=pruned, num_verified=verified
+    )
+
+
+def model(*names: str, **values) -> ModelSummary:
+    defaults = {
+        "num_points": 200,
+        "num_observations": 700,
+        "mean_track_length": 3.5,
+        "mean_observations_per_image": 700 / len(names),
+        "mean_error_px": 0.625,
+        "median_error_px": 0.5,
+        "p95_error_px": 1.75,
+    }
+    return ModelSummary(image_names=names, **(defaults | values))
+
+
+NAMES = [f"{letter}.jpg" for letter in "abcdefghijklm"]
+
+
+def report() -> SceneReport:
+    """Photos a–c in the model; every other one is missing for a reason of its own."""
+    pairs = [
+        pair("b.jpg", "c.jpg", 300, 90, 80),
+        pair("a.jpg", "b.jpg", 500, 110, 100),
+        # d: no pair at all; e: no putative match; f: pruned to nothing
+        pair("a.jpg", "e.jpg", 0, 0, 0),
+        pair("a.jpg", "f.jpg", 120, 0, 0),
+        pair("c.jpg", "f.jpg", 60, 0, 0),
+        # g: kept, not verified
+        pair("a.jpg", "g.jpg", 130, 9, 0),
+        # h–i: in the second model; j–k: a component of their own
+        pair("h.jpg", "i.jpg", 200, 40, 30),
+        pair("j.jpg", "k.jpg", 200, 20, 18),
+        # l: connected, not placed; m: the same by two pairs
+        pair("a.jpg", "l.jpg", 200, 30, 16),
+        pair("a.jpg", "m.jpg", 200, 30, 20),
+        pair("b.jpg", "m.jpg", 200, 30, 25),
+    ]
+    return make_report(
+        scene="desk",
+        image_names=reversed(NAMES),
+        pairs=pairs,
+        models=[model("a.jpg", "b.jpg", "c.jpg"), model("h.jpg", "i.jpg", mean_error_px=math.nan)],
+        stage_seconds={"features": 2.5, "models": 1.25},
+        configuration={"prune": {"method": "loransac"}},
+        versions={"corrsfm": "0.1.0"},
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "reason", "detail"),
+    [
+        ("d.jpg", MissingReason.NO_PAIR, "it was not matched with any photo"),
+        ("e.jpg", MissingReason.NO_MATCH, "no match in 1 pair; it may have no keypoints"),
+        ("f.jpg", MissingReason.PRUNED, "no match kept in 2 pairs; most putative ones: 120 with a.jpg"),
+        ("g.jpg", MissingReason.NOT_VERIFIED, "none of 1 pair verified; most kept: 9 with a.jpg"),
+        ("h.jpg", MissingReason.OTHER_MODEL, "one of 2 photos of model 1"),
+        ("i.jpg", MissingReason.OTHER_MODEL, "one of 2 photos of model 1"),
+        ("j.jpg", MissingReason.OTHER_COMPONENT, "verified pairs connect it with 1 other photo only"),
+        ("k.jpg", MissingReason.OTHER_COMPONENT, "verified pairs connect it with 1 other photo only"),
+        ("l.jpg", MissingReason.NOT_PLACED, "1 verified pair; most matches: 16 with a.jpg"),
+        ("m.jpg", MissingReason.NOT_PLACED, "2 verified pairs; most matches: 25 with b.jpg"),
+    ],
+)
+def test_each_missing_photo_has_its_reason(name: str, reason: MissingReason, detail: str) -> None:
+    missing = {image.name: image for image in report().missing}
+    assert (missing[name].reason, missing[name].detail) == (reason, detail)
+
+
+def test_every_photo_is_either_registered_or_missing_with_each_reason_shown() -> None:
+    names = [image.name for image in report().missing]
+    assert names == NAMES[3:]
+    assert {image.reason for image in report().missing} == set(MissingReason)
+
+
+def test_counts_are_exact() -> None:
+    made = report()
+    assert made.num_registered == 3
+    assert made.registered_percent == pytest.approx(300 / 13)
+    assert (made.num_verified_pairs, made.num_empty_pairs) == (7, 3)
+    assert made.num_matches == (2110, 359, 289)
+    assert made.components == (
+        ("a.jpg", "b.jpg", "c.jpg", "l.jpg", "m.jpg"),
+        ("h.jpg", "i.jpg"),
+        ("j.jpg", "k.jpg"),
+    )
+    assert [(p.name0, p.name1) for p in made.pairs] == sorted((p.name0, p.name1) for p in made.pairs)
+
+
+def test_component_of_the_first_model_counts_as_the_main_one() -> None:
+    pairs = [pair("a", "b", 99, 99, 99), pair("b", "c", 99, 99, 99), pair("x", "y", 99, 99, 99)]
+    made = make_report(scene="", image_names="abcxy", pairs=pairs, models=[model("x", "y")])
+    assert {image.name: image.reason for image in made.missing} == dict.fromkeys(
+        "abc", MissingReason.OTHER_COMPONENT
+    )
+
+
+def test_scene_without_a_model_is_reported() -> None:
+    made = make_report(scene="", image_names="abc", pairs=[pair("a", "b", 50, 20, 18)], models=[])
+    assert (made.num_registered, made.registered_percent) == (0, 0.0)
+    assert [image.reason for image in made.missing] == [
+        MissingReason.NOT_PLACED,
+        MissingReason.NOT_PLACED,
+        MissingReason.NO_PAIR,
+    ]
+    assert "models      none" in format_table(made)
+
+
+def test_report_survives_json() -> None:
+    made = report()
+    text = json.dumps(made.to_dict(), allow_nan=False)
+    read = SceneReport.from_dict(json.loads(text))
+    assert math.isnan(read.models[1].mean_error_px)
+
+    def without_nan(value: SceneReport) -> SceneReport:
+        second = dataclasses.replace(value.models[1], mean_error_px=0.0)
+        return dataclasses.replace(value, models=(value.models[0], second))
+
+    assert without_nan(read) == without_nan(made)
+
+
+def test_json_begins_with_a_summary() -> None:
+    values = report().to_dict()
+    assert list(values)[:2] == ["format_version", "summary"]
+    assert values["summary"]["model_sizes"] == [3, 2]
+    assert values["summary"]["num_points"] == 200
+    assert values["summary"]["seconds"] == 3.75
+
+
+def test_report_of_another_format_is_refused() -> None:
+    with pytest.raises(ValueError, match="report of format 99"):
+        SceneReport.from_dict(report().to_dict() | {"format_version": 99})
+
+
+def test_table_is_aligned_and_complete() -> None:
+    assert format_table(report()) == "\n".join(
+        [
+            "scene               desk",
+            "photos              3 of 13 registered (23.1 %)",
+            "models              2, with 3, 2 photos",
+            "points              200",
+            "observations        700, 233.3 a photo",
+            "track length        3.50 photos a point",
+            "reprojection error  0.50 px median, 0.62 mean, 1.75 95th percentile",
+            "pairs               11 matched, 7 verified, 3 pruned to nothing",
+            "matches             2,110 putative → 359 pruned (17.0 %) → 289 verified (13.7 %)",
+            "view graph          3 components of 5, 2, 2 photos, 4 without a verified pair",
+            "seconds             3.8: features 2.5, models 1.2",
+            "",
+            "not registered",
+            "  d.jpg  no pair                    it was not matched with any photo",
+            "  e.jpg  no putative match          no match in 1 pair; it may have no keypoints",
+            "  f.jpg  pruned to nothing          no match kept in 2 pairs; most putative ones: 120 with a.jpg",
+            "  g.jpg  too few verified matches   none of 1 pair verified; most kept: 9 with a.jpg",
+            "  h.jpg  in another model           one of 2 photos of model 1",
+            "  i.jpg  in another model           one of 2 photos of model 1",
+            "  j.jpg  other component            verified pairs connect it with 1 other photo only",
+            "  k.jpg  other component            verified pairs connect it with 1 other photo only",
+            "  l.jpg  mapper could not place it  1 verified pair; most matches: 16 with a.jpg",
+            "  m.jpg  mapper could not place it  2 verified pairs; most matches: 25 with b.jpg",
+        ]
+    )
+
+
+def test_table_shows_twenty_missing_photos_at_most() -> None:
+    made = make_report(scene="", image_names=[f"{i:03d}" for i in range(50)], pairs=[], models=[])
+    lines = format_table(made).splitlines()
+    assert lines[-1] == "  … and 30 more, see report.json"
+    assert sum("no pair" in line for line in lines) == 20
