@@ -122,7 +122,7 @@ def test_second_run_measures_only_what_is_new(pairs_file: Path, tmp_path: Path):
 def test_results_of_other_pairs_are_not_mixed(pairs_file: Path, tmp_path: Path):
     results = tmp_path / "pose.json"
     evaluate_pose(pairs_file, ["mutual/poselib"], results=results)
-    with pytest.raises(InputError, match=r"measured on other pairs .*--overwrite"):
+    with pytest.raises(InputError, match=r"measured on something else .*--overwrite"):
         evaluate_pose(pairs_file, ["mutual/poselib"], results=results, max_per_scene=1)
 
 

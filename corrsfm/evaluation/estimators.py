@@ -64,7 +64,6 @@ def _rays(correspondences: Correspondences) -> NDArray[np.float64]:
 
 
 def _pycolmap_camera(camera: Camera) -> Any:
-    import cv2  # noqa: F401  (must be loaded before pycolmap)
     import pycolmap
 
     return pycolmap.Camera(
@@ -187,7 +186,6 @@ def _colmap(
     correspondences: Correspondences, result: PruneResult, seed: int, *, threshold_px: float | None
 ) -> PoseEstimate | None:
     """COLMAP's LO-RANSAC for essential matrices, with COLMAP's budget for two-view geometries."""
-    import cv2  # noqa: F401  (must be loaded before pycolmap)
     import pycolmap
 
     kept = np.flatnonzero(result.inlier_mask)

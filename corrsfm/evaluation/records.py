@@ -20,7 +20,7 @@ import corrsfm
 from corrsfm.errors import InputError
 from corrsfm.workspace import atomic_write_text
 
-__all__ = ["file_sha256", "load_results", "provenance", "save_results"]
+__all__ = ["file_sha256", "kept_methods", "load_results", "provenance", "save_results"]
 
 FORMAT_VERSION = 1
 _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap", "poselib", "torch", "h5py")
@@ -101,6 +101,29 @@ def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:
             f"version {FORMAT_VERSION}; choose another --results file"
         )
     return values
+
+
+def kept_methods(
+    results: Path | None, kind: str, subject: dict[str, Any], *, overwrite: bool
+) -> dict[str, Any]:
+    """Methods that a result file already holds for the same subject.
+
+    Raises
+    ------
+    InputError
+        If the file is no result file, or was measured on something else and ``overwrite`` is not given.
+    """
+    if results is None or not results.exists():
+        return {}
+    values = load_results(results, kind)
+    if overwrite:
+        return {}
+    if values["subject"] != subject:
+        raise InputError(
+            f"{results}: measured on something else than asked for ({values['subject'].get('name')}, "
+            f"{values['subject'].get('num_pairs')} pairs); use --overwrite or another file"
+        )
+    return dict(values["methods"])
 
 
 def save_results(path: Path, kind: str, values: dict[str, Any]) -> None:

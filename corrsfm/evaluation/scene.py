@@ -107,7 +107,6 @@ def read_poses(folder: Path) -> dict[str, Pose]:
 
 
 def _read_colmap(folder: Path) -> dict[str, Pose]:
-    import cv2  # noqa: F401  (must be loaded before pycolmap)
     import pycolmap
 
     try:

@@ -22,7 +22,7 @@ from corrsfm.evaluation.metrics import (
     pose_map,
     precision_recall_f,
 )
-from corrsfm.evaluation.records import file_sha256, load_results, provenance, save_results
+from corrsfm.evaluation.records import file_sha256, kept_methods, provenance, save_results
 from corrsfm.geometry import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_sq
 from corrsfm.oanet import OANetPair, is_oanet_file, read_pairs
 
@@ -256,7 +256,7 @@ def _load_subject(path: Path, max_per_scene: int | None, seed: int) -> _Subject:
     pairs = load_labelled_pairs(path, max_per_scene=max_per_scene, seed=seed)
     scenes = [pair.scene or path.stem for pair in pairs]
     description = {
-        "file": path.name,
+        "name": path.name,
         "sha256": file_sha256(path),
         "max_per_scene": max_per_scene,
         "selection_seed": seed,
@@ -322,7 +322,7 @@ def evaluate_pose(
     """
     built = [parse_method(name, device=device, seed=seed, threads=threads) for name in methods]
     subject = _load_subject(path, max_per_scene, seed)
-    old = _kept_results(results, subject.description, overwrite)
+    old = kept_methods(results, "pose", subject.description, overwrite=overwrite)
     entries: dict[str, Any] = dict(old)
     for method in built:
         if not (method.name in old and old[method.name]["fingerprint"] == method.fingerprint):
@@ -338,20 +338,6 @@ def evaluate_pose(
                 known = baseline if baseline in entries else None
                 _write(results, subject, entries, known, seed, command, device)
     return _write(results, subject, entries, baseline, seed, command, device)
-
-
-def _kept_results(results: Path | None, description: dict[str, Any], overwrite: bool) -> dict[str, Any]:
-    if results is None or not results.exists():
-        return {}
-    values = load_results(results, "pose")
-    if values["subject"] != description:
-        if overwrite:
-            return {}
-        raise InputError(
-            f"{results}: measured on other pairs ({values['subject'].get('file')}, "
-            f"{values['subject'].get('num_pairs')} pairs) than asked for; use --overwrite or another file"
-        )
-    return {} if overwrite else dict(values["methods"])
 
 
 def _write(

@@ -1,0 +1,208 @@
+"""Commands that measure: two-view poses, homographies, whole scenes, and the tables made from the results."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from corrsfm.cli.options import echo_json, json_option, overwrite_option, run_options
+from corrsfm.config import RunConfig
+
+__all__ = ["evaluate"]
+
+FILTERS = (
+    "nn, mutual, ratioT, ratioT+mutual (T such as 0.8), oracle (the right matches), or a method of "
+    "`corrsfm prune` as METHOD[@sfm|@pose][:CHECKPOINT]"
+)
+ESTIMATORS = (
+    "ransac, usac, accurate, magsac, prosac, degensac, colmap, poselib or w8pt, with :PIXELS if wanted"
+)
+PATH = click.Path(path_type=Path)
+results_option = click.option(
+    "--results", type=PATH, help="Result file; what it holds already is not measured again."
+)
+
+
+@click.group()
+def evaluate() -> None:
+    """Measure methods and reconstructions."""
+
+
+def _command_line() -> str:
+    """The command as typed, for result files: the program by its name, not its place."""
+    return shlex.join(["corrsfm", *sys.argv[1:]])
+
+
+def _device(run: RunConfig) -> str:
+    from corrsfm.machine import device_of, use_threads
+
+    use_threads(run)
+    return device_of(run)
+
+
+def _method_bar(name: str, total: int) -> Callable[[int], None]:
+    from tqdm import tqdm
+
+    bar = tqdm(total=total, desc=name, unit="pair")
+
+    def advance(count: int) -> None:
+        bar.update(count)
+        if bar.n >= total:
+            bar.close()
+
+    return advance
+
+
+def _show(values: dict[str, Any], as_json: bool) -> None:
+    from corrsfm.evaluation.tables import render_table
+
+    if as_json:
+        echo_json(values)
+    else:
+        click.echo(render_table(values))
+
+
+@evaluate.command()
+@click.argument("pairs_file", metavar="FILE.h5", type=PATH)
+@click.option(
+    "--method",
+    "methods",
+    multiple=True,
+    help=f"FILTER/ESTIMATOR; give it several times; the classical ones if not given. Filters: {FILTERS}. "
+    f"Estimators: {ESTIMATORS}.",
+)
+@click.option("--baseline", help="Method that differences refer to; the first one if not given.")
+@click.option("--max-per-scene", type=click.IntRange(min=1), help="Use so many random pairs of each scene.")
+@results_option
+@run_options
+@overwrite_option
+@json_option
+def pose(
+    pairs_file: Path,
+    methods: tuple[str, ...],
+    baseline: str | None,
+    max_per_scene: int | None,
+    results: Path | None,
+    run: RunConfig,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Relative pose and matches kept, on labelled pairs.
+
+    FILE.h5 is in OANet's layout (YFCC100M, SUN3D) or comes from `corrsfm train prepare`.
+    """
+    from corrsfm.evaluation.methods import CLASSICAL_METHODS
+    from corrsfm.evaluation.two_view import evaluate_pose
+
+    values = evaluate_pose(
+        pairs_file,
+        methods or CLASSICAL_METHODS,
+        results=results,
+        baseline=baseline,
+        max_per_scene=max_per_scene,
+        seed=run.seed,
+        device=_device(run),
+        threads=run.threads,
+        overwrite=overwrite,
+        command=_command_line(),
+        on_method=_method_bar,
+    )
+    _show({"kind": "pose", **values}, as_json)
+
+
+@evaluate.command()
+@click.argument("folder", metavar="DIR", type=PATH)
+@click.option("--filter", "filters", multiple=True, help=f"Filter; give it several times. {FILTERS}.")
+@results_option
+@run_options
+@overwrite_option
+@json_option
+def homography(
+    folder: Path,
+    filters: tuple[str, ...],
+    results: Path | None,
+    run: RunConfig,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Homography of planes, on a folder in HPatches' layout."""
+    from tqdm import tqdm
+
+    from corrsfm.evaluation.homography import evaluate_homography
+
+    with tqdm(unit="sequence") as bar:
+
+        def advance(name: str, total: int) -> None:
+            bar.total = total
+            bar.set_description(name)
+            bar.update()
+
+        values = evaluate_homography(
+            folder,
+            filters or ("nn", "mutual", "ratio0.8+mutual", "oracle"),
+            results=results,
+            seed=run.seed,
+            device=_device(run),
+            threads=run.threads,
+            overwrite=overwrite,
+            command=_command_line(),
+            on_sequence=advance,
+        )
+    _show({"kind": "homography", **values}, as_json)
+
+
+@evaluate.command()
+@click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
+@click.option(
+    "--ground-truth",
+    required=True,
+    type=PATH,
+    help="COLMAP model, or folder of camera files PHOTO.json with the rotation (3 × 3) and translation (3) "
+    "of cam_from_world.",
+)
+@json_option
+def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
+    """A reconstruction against known cameras. WORKSPACE may also be a COLMAP model."""
+    from corrsfm.evaluation.scene import evaluate_scene
+
+    score = evaluate_scene(workspace_dir, ground_truth)
+    if as_json:
+        echo_json(score.to_dict())
+        return
+    click.echo(f"registered          {score.num_registered} of {score.num_photos} photos")
+    for threshold, value in score.auc.items():
+        click.echo(f"pose AUC@{threshold + '°':<11}{value:.1f} %")
+    if score.position_error_mean is None:
+        click.echo("position error      undetermined: fewer than 3 registered photos, or all on a line")
+    else:
+        click.echo(
+            f"position error      mean {score.position_error_mean:.4g}, "
+            f"median {score.position_error_median:.4g}, max {score.position_error_max:.4g} in units of the ground truth "
+            f"(mean {score.position_error_percent:.2f} % of its extent)"
+        )
+
+
+@evaluate.command()
+@click.argument("documents", metavar="DOCUMENT...", nargs=-1, required=True, type=PATH)
+@click.option(
+    "--results-dir", type=PATH, default=Path("results"), show_default=True, help="Folder of the result files."
+)
+@click.option("--check", is_flag=True, help="Change nothing; fail if a table differs from its results.")
+def tables(documents: tuple[Path, ...], results_dir: Path, check: bool) -> None:
+    """Render the tables of documents from result files.
+
+    A table stands between the lines `<!-- table:NAME -->` and `<!-- /table -->` and shows NAME.json.
+    """
+    from corrsfm.evaluation.tables import update_document
+
+    changed = [path for path in documents if update_document(path, results_dir, check=check)]
+    if changed and check:
+        names = ", ".join(str(path) for path in changed)
+        raise click.ClickException(f"tables differ from their results in {names}; run without --check")
+    for path in changed:
+        click.echo(f"{path}: tables rendered anew")
