@@ -182,8 +182,8 @@ def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
     else:
         click.echo(
             f"position error      mean {score.position_error_mean:.4g}, "
-            f"median {score.position_error_median:.4g}, max {score.position_error_max:.4g} in units of the ground truth "
-            f"(mean {score.position_error_percent:.2f} % of its extent)"
+            f"median {score.position_error_median:.4g}, max {score.position_error_max:.4g} "
+            f"in units of the ground truth (mean {score.position_error_percent:.2f} % of its extent)"
         )
 
 
