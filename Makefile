@@ -1,5 +1,6 @@
 # make demo   reconstruct a bundled scene, print the statistics, write a page to look at
 # make test   the default tests (minutes); make test-slow adds the sample scenes end to end
+# make reference   write the command-line reference anew
 # make lint   format check, linter, type checker
 
 PYTHON ?= python3
@@ -7,7 +8,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format clean
+.PHONY: demo test test-slow lint format reference clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
@@ -35,6 +36,9 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+reference: $(STAMP)
+	$(BIN)/python -m corrsfm.cli.reference
 
 clean:
 	rm -rf $(VENV) demo build dist *.egg-info

@@ -320,8 +320,8 @@ def reconstruct(
             workspace.sparse,
             config=config,
             seed=run.seed,
-            threads=threads_of(run),
-            log_path=workspace.log,
+            num_threads=threads_of(run),
+            log_file=workspace.log,
             on_progress=on_progress,
         )
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)

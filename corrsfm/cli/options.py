@@ -6,16 +6,24 @@ import dataclasses
 import functools
 import json
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from corrsfm import config as cfg
 
-__all__ = ["config_options", "echo_json", "json_option", "overwrite_option", "run_options"]
+__all__ = [
+    "config_options",
+    "echo_json",
+    "json_option",
+    "overwrite_option",
+    "pipeline_options",
+    "run_options",
+]
 
 F = typing.TypeVar("F", bound=Callable[..., Any])
 
@@ -51,9 +59,7 @@ def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
 def config_options(**configs: type) -> Callable[[F], F]:
     """Give a command a flag for every field of the named config dataclasses.
 
-    ``@config_options(features=FeaturesConfig)`` calls the command with ``features=FeaturesConfig(...)``. If
-    the command has an option ``--pipeline``, its file is read first and only flags that the user really typed
-    override it.
+    ``@config_options(features=FeaturesConfig)`` calls the command with ``features=FeaturesConfig(...)``.
 
     Raises
     ------
@@ -64,29 +70,57 @@ def config_options(**configs: type) -> Callable[[F], F]:
     def decorate(command: F) -> F:
         @functools.wraps(command)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
-            context = click.get_current_context()
-            pipeline_file = kwargs.get("pipeline")
-            base = cfg.load_pipeline(pipeline_file) if pipeline_file else cfg.PipelineConfig()
             for keyword, cls in configs.items():
-                given = {}
-                for entry in dataclasses.fields(cls):
-                    value = kwargs.pop(entry.name)
-                    if context.get_parameter_source(entry.name) is not click.core.ParameterSource.DEFAULT:
-                        given[entry.name] = value
-                kwargs[keyword] = _override(getattr(base, keyword, None) or cls(), given)
+                kwargs[keyword] = _override(cls(), kwargs)
             return command(*args, **kwargs)
 
-        for cls in reversed(configs.values()):
-            annotations = typing.get_type_hints(cls)
-            for entry in reversed(dataclasses.fields(cls)):
-                wrapped = _option(entry, annotations[entry.name])(wrapped)
-        return typing.cast(F, wrapped)
+        return typing.cast(F, _with_flags(wrapped, configs.values()))
 
     return decorate
 
 
-def _override(base: Any, given: dict[str, Any]) -> Any:
-    """A config with the given values from the command line, checked."""
+def pipeline_options(command: F) -> F:
+    """``--pipeline FILE`` and a flag for every option of every stage.
+
+    The command is called with ``config=PipelineConfig(...)``: the file's values, overridden by the flags that
+    the user really typed.
+    """
+    stages = {
+        entry.name: typing.cast(type, entry.default_factory)
+        for entry in dataclasses.fields(cfg.PipelineConfig)
+    }
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, pipeline: Path | None, **kwargs: Any) -> Any:
+        base = cfg.load_pipeline(pipeline) if pipeline else cfg.PipelineConfig()
+        overridden = {name: _override(getattr(base, name), kwargs) for name in stages}
+        return command(*args, config=cfg.PipelineConfig(**overridden), **kwargs)
+
+    file_option = click.option(
+        "--pipeline",
+        type=click.Path(path_type=Path),
+        help="Pipeline file in TOML; flags typed here override it.",
+    )
+    return typing.cast(F, file_option(_with_flags(wrapped, stages.values())))
+
+
+def _with_flags(command: Callable, configs: Collection[type]) -> Callable:
+    """Click options for every field of some config dataclasses, in order."""
+    for cls in reversed(list(configs)):
+        annotations = typing.get_type_hints(cls)
+        for entry in reversed(dataclasses.fields(cls)):
+            command = _option(entry, annotations[entry.name])(command)
+    return command
+
+
+def _override(base: Any, values: dict[str, Any]) -> Any:
+    """A config with the flags that the user typed, which are taken out of ``values``, all checked."""
+    context = click.get_current_context()
+    given = {}
+    for entry in dataclasses.fields(base):
+        value = values.pop(entry.name)
+        if context.get_parameter_source(entry.name) is not ParameterSource.DEFAULT:
+            given[entry.name] = value
     checked = cfg.from_dict(type(base), given, "command line")
     return dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
 

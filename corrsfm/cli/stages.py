@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 import click
 
 from corrsfm import config as cfg
-from corrsfm.cli.options import config_options, echo_json, json_option, overwrite_option, run_options
+from corrsfm.cli.options import (
+    config_options,
+    echo_json,
+    json_option,
+    overwrite_option,
+    pipeline_options,
+    run_options,
+)
 
 if TYPE_CHECKING:
     from corrsfm.pipeline import StageOutcome
@@ -156,35 +163,16 @@ def report(workspace_dir: Path, as_json: bool) -> None:
 @click.command()
 @IMAGES
 @WORKSPACE
-@click.option(
-    "--pipeline", type=click.Path(path_type=Path), help="Pipeline file in TOML; flags typed here override it."
-)
-@config_options(
-    images=cfg.ImagesConfig,
-    features=cfg.FeaturesConfig,
-    pairs=cfg.PairsConfig,
-    matches=cfg.MatchesConfig,
-    prune=cfg.PruneConfig,
-    database=cfg.DatabaseConfig,
-    reconstruction=cfg.ReconstructionConfig,
-)
-@run_options
+@pipeline_options
 @overwrite_option
 @json_option
 def run(
-    images_dir: Path,
-    workspace_dir: Path,
-    pipeline: Path | None,
-    overwrite: bool,
-    as_json: bool,
-    **configs: object,
+    images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, overwrite: bool, as_json: bool
 ) -> None:
     """Do everything: from a folder of photos to models and a report."""
-    from corrsfm import scene_run
+    from corrsfm.run import run_scene
 
-    scene_run.run_scene(
-        images_dir, workspace_dir, cfg.PipelineConfig(**configs), pipeline_file=pipeline, overwrite=overwrite
-    )  # type: ignore[arg-type]
+    run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
     _print_report(workspace_dir, as_json)
     if not as_json:
         click.echo(f"\nreport: {workspace_dir / 'report.html'}")
@@ -193,14 +181,14 @@ def run(
 def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> None:
     """The statistics on standard output; report.json always, report.html if asked for."""
     from corrsfm import pipeline
-    from corrsfm.report import format_table, report_to_dict
+    from corrsfm.report import format_table
     from corrsfm.workspace import Workspace
 
     workspace = Workspace(workspace_dir)
     with workspace.lock():
         result = pipeline.report(workspace, html=html)
     if as_json:
-        echo_json(report_to_dict(result))
+        echo_json(result.to_dict())
     else:
         click.echo(format_table(result))
         if html:

@@ -1,0 +1,42 @@
+"""The command for many scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from corrsfm.cli.options import echo_json, json_option
+
+__all__ = ["batch"]
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("collection", type=click.Path(path_type=Path))
+@click.argument("output", type=click.Path(path_type=Path))
+@click.argument("run_arguments", nargs=-1, type=click.UNPROCESSED)
+@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Scenes at a time.")
+@click.option("--dask", metavar="ADDRESS", help="Dask scheduler whose workers run the scenes instead.")
+@json_option
+def batch(
+    collection: Path, output: Path, run_arguments: tuple[str, ...], jobs: int, dask: str | None, as_json: bool
+) -> None:
+    """Run every scene of a COLLECTION into OUTPUT/<scene>.
+
+    A scene is a sub-folder with photos, or with a folder `images` of photos. All further arguments go to
+    `corrsfm run`. One scene's failure does not stop the others; run it again to go on.
+    """
+    from corrsfm.batch import run_collection
+
+    statuses = run_collection(collection, output, run_arguments, jobs=jobs, dask=dask)
+    if as_json:
+        echo_json([status.__dict__ for status in statuses])
+    else:
+        for status in statuses:
+            result = "ok    " if status.succeeded else "FAILED"
+            click.echo(f"{status.scene:<24} {result} {status.seconds:8.1f} s  {status.message}")
+    failed = sum(not status.succeeded for status in statuses)
+    if failed:
+        raise click.ClickException(
+            f"{failed} of {len(statuses)} scenes failed; see {output}/<scene>.batch.log"
+        )

@@ -1,0 +1,93 @@
+"""A whole run: all stages over one workspace, and `run.json`, the record of what made it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import time
+from pathlib import Path
+from typing import Any
+
+from corrsfm import __version__, pipeline
+from corrsfm import config as cfg
+from corrsfm.errors import ReconstructionError
+from corrsfm.index import read_index
+from corrsfm.resume import StageOutcome
+from corrsfm.workspace import STAGE_COMMANDS, Workspace, atomic_write_json
+
+__all__ = ["run_scene", "versions"]
+
+RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
+
+
+def run_scene(
+    images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
+) -> list[StageOutcome]:
+    """Go from a folder of photos to models and a report, skipping what is finished.
+
+    Parameters
+    ----------
+    images_dir, workspace_dir : Path
+    config : PipelineConfig
+    overwrite : bool
+        Redo finished work.
+
+    Returns
+    -------
+    list of StageOutcome
+
+    Raises
+    ------
+    CorrsfmError
+        What the stages raise. If mapping fails, the report is written all the same, because it tells why.
+    """
+    workspace = Workspace(workspace_dir, create=True)
+    run = config.run
+    with workspace.lock():
+        outcomes = [
+            pipeline.index_photos(workspace, images_dir, config.images, run),
+            pipeline.extract_features(workspace, config.features, run, overwrite=overwrite),
+            pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite),
+            pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite),
+            pipeline.prune_matches(workspace, config.prune, run, overwrite=overwrite),
+            pipeline.verify_matches(workspace, config.database, run, overwrite=overwrite),
+        ]
+        try:
+            outcomes.append(pipeline.reconstruct(workspace, config.reconstruction, run, overwrite=overwrite))
+        except ReconstructionError:
+            pipeline.report(workspace, html=True)
+            raise
+        atomic_write_json(workspace.run_json, _run_record(workspace, config))
+        pipeline.report(workspace, html=True)
+    return outcomes
+
+
+def versions() -> dict[str, str]:
+    """Versions of corrsfm, Python and the packages that results depend on."""
+    found = {"corrsfm": __version__, "python": platform.python_version()}
+    for package in RECORDED_PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, Any]:
+    from corrsfm.prune import checkpoint_sha256
+
+    records = {stage: workspace.record_of(stage) for stage in STAGE_COMMANDS}
+    return {
+        "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        "versions": versions(),
+        "platform": platform.platform(),
+        "seed": config.run.seed,
+        "config": cfg.to_dict(config),
+        "checkpoint_sha256": checkpoint_sha256(config.prune),
+        "images_dir": str(workspace.images_dir),
+        "images_sha256": {record.name: record.sha256 for record in read_index(workspace).records},
+        "seconds": {stage: record.seconds for stage, record in records.items() if record is not None},
+        "fingerprints": {
+            stage: record.fingerprint for stage, record in records.items() if record is not None
+        },
+    }

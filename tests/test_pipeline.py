@@ -1,0 +1,295 @@
+"""Resume that can be trusted: what is redone, what is kept, and that a kill loses nothing."""
+
+import dataclasses
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+from photos import write_photo, write_photos
+
+from corrsfm import config as cfg
+from corrsfm import pipeline
+from corrsfm.errors import ImageError, WorkspaceError
+from corrsfm.index import read_index, read_pairs
+from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
+from corrsfm.workspace import Workspace
+
+RUN = cfg.RunConfig(threads=1, device="cpu")
+SMALL = cfg.FeaturesConfig(max_features=60)
+
+
+def run_front(
+    workspace: Workspace,
+    photos: Path,
+    features: cfg.FeaturesConfig = SMALL,
+    pairs: cfg.PairsConfig | None = None,
+    prune: cfg.PruneConfig | None = None,
+) -> dict[str, tuple[int, int]]:
+    """Run all stages up to pruning; stage → (items, of which were kept)."""
+    outcomes = [
+        pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN),
+        pipeline.extract_features(workspace, features, RUN),
+        pipeline.make_pairs(workspace, pairs or cfg.PairsConfig(), RUN),
+        pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN),
+        pipeline.prune_matches(workspace, prune or cfg.PruneConfig(method=cfg.PruneMethod.RATIO), RUN),
+    ]
+    return {outcome.stage: (outcome.num_items, outcome.num_reused) for outcome in outcomes}
+
+
+def contents(workspace: Workspace) -> dict[str, object]:
+    """Everything a workspace holds up to pruning, as comparable values."""
+    values: dict[str, object] = {}
+    with ItemStore(workspace.features, FEATURES).reader() as read:
+        for name in read_index(workspace).names:
+            item = read(name)
+            values[name] = (item.keypoints.tobytes(), item.descriptors.tobytes())
+    with ItemStore(workspace.matches, MATCHES).reader() as read_matches:
+        for pair in read_pairs(workspace).pairs:
+            values[f"m {pair}"] = read_matches(pair).indices.tobytes()
+    with ItemStore(workspace.pruned, PRUNED).reader() as read_pruned:
+        for pair in read_pairs(workspace).pairs:
+            values[f"p {pair}"] = read_pruned(pair).indices.tobytes()
+    return values
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    write_photos(tmp_path / "photos", 4)
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path / "scene", create=True)
+
+
+def test_a_second_run_keeps_everything(workspace: Workspace, photos: Path) -> None:
+    assert run_front(workspace, photos)["matches"] == (6, 0)
+    before = {path.name: path.stat().st_mtime_ns for path in workspace.root.glob("*.h5")}
+    assert len(before) == 3
+    again = run_front(workspace, photos)
+    assert all(items == kept for stage, (items, kept) in again.items() if stage != "images")
+    assert before == {path.name: path.stat().st_mtime_ns for path in workspace.root.glob("*.h5")}
+
+
+def test_a_changed_photo_redoes_its_features_and_its_pairs_only(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    write_photo(photos / "2.png", 85)
+    outcome = run_front(workspace, photos)
+    assert outcome["features"] == (4, 3)
+    assert outcome["matches"] == (6, 3)
+    assert outcome["pruned matches"] == (6, 3)
+
+
+def test_a_new_photo_adds_its_features_and_pairs_only(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    write_photo(photos / "new.png", 20)
+    outcome = run_front(workspace, photos)
+    assert outcome["features"] == (5, 4)
+    assert outcome["matches"] == (10, 6)
+
+
+def test_a_removed_photo_leaves_no_trace(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    (photos / "1.png").unlink()
+    outcome = run_front(workspace, photos)
+    assert outcome["features"] == (3, 3)
+    assert outcome["matches"] == (3, 3)
+    assert not [key for key in contents(workspace) if "1.png" in key]
+
+
+def test_a_changed_prune_option_redoes_pruning_only(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    outcome = run_front(workspace, photos, prune=cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=0.7))
+    assert outcome["features"] == (4, 4)
+    assert outcome["matches"] == (6, 6)
+    assert outcome["pruned matches"] == (6, 0)
+
+
+def test_an_option_of_speed_redoes_nothing(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(block_size=17), RUN)
+    outcome = run_front(workspace, photos)
+    assert outcome["pruned matches"] == (6, 6)
+
+
+def test_what_changed_is_said(workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run_front(workspace, photos)
+    write_photo(photos / "2.png", 85)
+    with caplog.at_level("INFO", logger="corrsfm"):
+        run_front(workspace, photos, features=dataclasses.replace(SMALL, max_features=50))
+    assert "photos changed since the last run: 1 (2.png)" in caplog.text
+    assert "features: redone where needed (max_features 60 → 50)" in caplog.text
+
+
+def test_pruning_after_new_features_asks_for_matching_first(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    pipeline.extract_features(workspace, cfg.FeaturesConfig(max_features=40), RUN)
+    with pytest.raises(WorkspaceError, match="older than features; run: corrsfm"):
+        pipeline.prune_matches(workspace, cfg.PruneConfig(method=cfg.PruneMethod.RATIO), RUN)
+
+
+def test_a_deleted_file_is_made_again(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    before = contents(workspace)
+    workspace.matches.unlink()
+    assert run_front(workspace, photos)["matches"] == (6, 0)
+    assert contents(workspace) == before
+
+
+def test_a_half_written_feature_file_is_refused_not_used(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    workspace.features.write_bytes(workspace.features.read_bytes()[:1000])
+    with pytest.raises(WorkspaceError, match=r"features\.h5: not a readable HDF5 file"):
+        run_front(workspace, photos)
+
+
+def test_an_unreadable_photo_is_named_and_the_others_are_kept(workspace: Workspace, photos: Path) -> None:
+    whole = (photos / "2.png").read_bytes()
+    (photos / "2.png").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ImageError, match=r"2\.png"):
+        run_front(workspace, photos)
+    (photos / "2.png").write_bytes(whole)
+    assert run_front(workspace, photos)["features"][0] == 4
+
+
+class RandomHistory(RuleBasedStateMachine):
+    """Whatever happened to a workspace, running it again equals starting afresh."""
+
+    @initialize()
+    def start(self) -> None:
+        self.root = Path(os.environ["TMPDIR_FOR_HISTORY"]) / f"{random.getrandbits(64):x}"
+        self.photos = self.root / "photos"
+        write_photos(self.photos, 3)
+        self.workspace = Workspace(self.root / "scene", create=True)
+        self.features = SMALL
+        self.pairs = cfg.PairsConfig()
+        self.prune = cfg.PruneConfig(method=cfg.PruneMethod.RATIO)
+
+    @rule(number=st.integers(0, 4), position=st.integers(0, 300))
+    def write(self, number: int, position: int) -> None:
+        write_photo(self.photos / f"{number}.png", position)
+
+    @rule(number=st.integers(2, 4))
+    def remove(self, number: int) -> None:
+        (self.photos / f"{number}.png").unlink(missing_ok=True)
+
+    @rule(num=st.sampled_from([40, 60]))
+    def change_features(self, num: int) -> None:
+        self.features = cfg.FeaturesConfig(max_features=num)
+
+    @rule(overlap=st.integers(1, 3))
+    def change_pairs(self, overlap: int) -> None:
+        self.pairs = cfg.PairsConfig(pairing=(cfg.PairStrategy.SEQUENTIAL,), sequential_overlap=overlap)
+
+    @rule(ratio=st.sampled_from([0.7, 0.8]))
+    def change_pruning(self, ratio: float) -> None:
+        self.prune = cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=ratio)
+
+    @rule(name=st.sampled_from(["features.h5", "matches.h5", "pruned.h5", "pairs.txt", "images.json"]))
+    def lose_a_file(self, name: str) -> None:
+        (self.workspace.root / name).unlink(missing_ok=True)
+
+    @rule(after=st.integers(0, 12))
+    def interrupt(self, after: int) -> None:
+        count = 0
+        add = ItemStore.add
+
+        def stop(self: ItemStore, *arguments: object) -> None:
+            nonlocal count
+            if count == after:
+                raise KeyboardInterrupt
+            count += 1
+            add(self, *arguments)
+
+        ItemStore.add = stop  # type: ignore[method-assign]
+        try:
+            self.run(self.workspace)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            ItemStore.add = add  # type: ignore[method-assign]
+
+    def run(self, workspace: Workspace) -> None:
+        run_front(workspace, self.photos, self.features, self.pairs, self.prune)
+
+    @invariant()
+    def running_again_equals_a_fresh_start(self) -> None:
+        if not hasattr(self, "root"):
+            return
+        copy = self.root / "copy"
+        shutil.copytree(self.workspace.root, copy)
+        self.run(Workspace(copy))
+        fresh = Workspace(self.root / "fresh", create=True)
+        self.run(fresh)
+        assert contents(Workspace(copy)) == contents(fresh)
+        shutil.rmtree(copy)
+        shutil.rmtree(fresh.root)
+
+    def teardown(self) -> None:
+        if hasattr(self, "root"):
+            shutil.rmtree(self.root)
+
+
+def test_any_history_of_a_workspace_ends_like_a_fresh_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hypothesis.stateful import run_state_machine_as_test
+
+    monkeypatch.setenv("TMPDIR_FOR_HISTORY", str(tmp_path))
+    run_state_machine_as_test(
+        RandomHistory,
+        settings=settings(
+            max_examples=6,
+            stateful_step_count=5,
+            deadline=None,
+            derandomize=True,
+            suppress_health_check=list(HealthCheck),
+        ),
+    )
+
+
+def test_killing_the_process_anywhere_loses_nothing(tmp_path: Path, photos: Path) -> None:
+    arguments = ["--max-features", "60", "--threads", "1", "--device", "cpu"]
+    command = [sys.executable, "-m", "corrsfm", "extract", str(photos)]
+    subprocess.run([*command, str(tmp_path / "straight"), *arguments], check=True, capture_output=True)
+    killed = 0
+    for milliseconds in (1200, 2400, 3600):
+        process = subprocess.Popen(
+            [*command, str(tmp_path / "killed"), *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        time.sleep(milliseconds / 1000)
+        killed += process.poll() is None
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    result = subprocess.run([*command, str(tmp_path / "killed"), *arguments], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    assert killed
+    workspaces = [Workspace(tmp_path / name) for name in ("straight", "killed")]
+    for workspace in workspaces:
+        pipeline.prune_matches(workspace, cfg.PruneConfig(method=cfg.PruneMethod.RATIO), RUN)
+    assert contents(workspaces[0]) == contents(workspaces[1])
+    names = [{path.name for path in workspace.root.iterdir()} for workspace in workspaces]
+    assert names[0] == names[1]
+
+
+def test_same_input_gives_same_bytes(tmp_path: Path, photos: Path) -> None:
+    values = []
+    for name in ("a", "b"):
+        workspace = Workspace(tmp_path / name, create=True)
+        run_front(workspace, photos)
+        values.append(contents(workspace))
+    assert values[0] == values[1]
+    assert any(np.frombuffer(value, np.int32).size for key, value in values[0].items() if key[:2] == "p ")  # type: ignore[arg-type]
