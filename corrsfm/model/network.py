@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -49,9 +49,9 @@ def full_precision(x: Tensor) -> torch.autocast:
     return torch.autocast(x.device.type, enabled=False)
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Rows of a batch
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 def row_sum(x: Tensor, mask: Tensor | None) -> Tensor:
@@ -69,7 +69,7 @@ def row_count(x: Tensor, mask: Tensor | None) -> Tensor | int:
 
 def row_mean(x: Tensor, mask: Tensor | None) -> Tensor:
     """Mean over the correspondences of each pair: (B,N,...) to (B,1,...)."""
-    return x.mean(1, keepdim=True) if mask is None else row_sum(x, mask) / row_count(x, mask)
+    return row_sum(x, mask) / row_count(x, mask)
 
 
 def row_max(x: Tensor, mask: Tensor | None) -> Tensor:
@@ -94,6 +94,15 @@ def take_rows(x: Tensor, index: Tensor) -> Tensor:
     return x.flatten(0, 1).index_select(0, flat.flatten()).view(*index.shape, channels)
 
 
+class BatchNorm(nn.BatchNorm1d):
+    """Holds scale, shift and running statistics; `normalise` and `linear_norm` apply them to channels-last rows."""
+
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+    momentum: float
+
+
 class Centred(NamedTuple):
     """A feature map minus its mean over the positions of each pair, and its variance there."""
 
@@ -112,9 +121,10 @@ def centre(x: Tensor, mask: Tensor | None) -> Centred:
     wide = torch.promote_types(x.dtype, torch.float32)
     positions = tuple(range(1, x.ndim - 1))
     if mask is None:
-        mean = x.mean(positions, keepdim=True)
-        values = x - mean
-        return Centred(values, values.square().mean(positions, keepdim=True).to(wide))
+        # Sums rather than means: in bfloat16 a mean copies its input to float32 first.
+        count: Tensor | int = math.prod(x.shape[1:-1])
+        values = x - x.sum(positions, keepdim=True) / count
+        return Centred(values, values.square().sum(positions, keepdim=True).to(wide) / count)
     with full_precision(x):
         count = mask.sum(1).view(-1, *[1] * (x.ndim - 1)) * math.prod(x.shape[2:-1])
         mean = row_sum(x.to(wide), mask).sum(positions, keepdim=True) / count
@@ -123,7 +133,7 @@ def centre(x: Tensor, mask: Tensor | None) -> Centred:
     return Centred(values, variance)
 
 
-def normalise(centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor | None) -> Tensor:
+def normalise(centred: Centred, norm: BatchNorm, eps: float, mask: Tensor | None) -> Tensor:
     """Instance normalisation without affine, then batch normalisation, as one scale and one shift.
 
     Instance-normalised features have mean 0 and variance v / (v + eps) in every pair, so the batch statistics follow
@@ -141,7 +151,7 @@ def normalise(centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor |
 
 
 def _follow_batch(
-    centred: Centred, norm: nn.BatchNorm1d, eps: float, mask: Tensor | None
+    centred: Centred, norm: BatchNorm, eps: float, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Mean and variance of instance-normalised features over the batch; updates the running statistics."""
     values, variance = centred
@@ -162,7 +172,7 @@ def _follow_batch(
     return batch_mean, batch_variance
 
 
-def linear_norm(x: Tensor, linear: nn.Linear, norm: nn.BatchNorm1d, mask: Tensor | None = None) -> Tensor:
+def linear_norm(x: Tensor, linear: nn.Linear, norm: BatchNorm, mask: Tensor | None = None) -> Tensor:
     """Linear layer, then batch normalisation over all rows; at inference folded into one linear layer."""
     if not norm.training:
         gain = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
@@ -178,9 +188,9 @@ def linear_norm(x: Tensor, linear: nn.Linear, norm: nn.BatchNorm1d, mask: Tensor
     )
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Explicit branch (section 3.3)
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 def nearest_neighbors(features: Tensor, k: int, mask: Tensor | None) -> Tensor:
@@ -195,7 +205,9 @@ def nearest_neighbors(features: Tensor, k: int, mask: Tensor | None) -> Tensor:
         if mask is not None:
             squared_norm = squared_norm.masked_fill(~mask, math.inf)
         # |f_j|^2 - 2 f_i.f_j orders the neighbours of i as the distance does: |f_i|^2 is the same for all j.
-        ranking = torch.baddbmm(squared_norm[:, None], features, features.mT, alpha=-2)  # (B,N,N)
+        ones = torch.ones_like(squared_norm)[..., None]
+        left, right = torch.cat([features, ones], dim=-1), torch.cat([-2 * features, squared_norm[..., None]], -1)
+        ranking = left @ right.mT  # (B,N,N)
         values, index = ranking.topk(k, dim=-1, largest=False, sorted=True)
         if mask is not None:
             itself = torch.arange(features.shape[1], device=features.device)[None, :, None]
@@ -209,9 +221,9 @@ class AttentionMap(nn.Module):
     def __init__(self, channels: int, hidden: int) -> None:
         super().__init__()
         self.squeeze = nn.Linear(channels, hidden)
-        self.squeeze_norm = nn.BatchNorm1d(hidden)
+        self.squeeze_norm = BatchNorm(hidden)
         self.expand = nn.Linear(hidden, channels)
-        self.expand_norm = nn.BatchNorm1d(channels)
+        self.expand_norm = BatchNorm(channels)
 
     def forward(self, pooled: Tensor, mask: Tensor | None = None) -> Tensor:
         x = F.gelu(linear_norm(pooled, self.squeeze, self.squeeze_norm, mask))
@@ -223,13 +235,14 @@ class PointContext(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm1 = nn.BatchNorm1d(channels)
+        self.norm1 = BatchNorm(channels)
         self.linear1 = nn.Linear(channels, channels)
-        self.norm2 = nn.BatchNorm1d(channels)
+        self.norm2 = BatchNorm(channels)
         self.linear2 = nn.Linear(channels, channels)
 
     def forward(self, graph: Tensor, mask: Tensor | None) -> Tensor:
-        x = self.linear1(F.gelu(normalise(centre(graph, mask), self.norm1, 1e-3, mask)))
+        x = F.gelu(normalise(centre(graph, mask), self.norm1, 1e-3, mask))
+        x = F.linear(x, self.linear1.weight)  # its bias would vanish in the normalisation that follows
         return self.linear2(F.gelu(normalise(centre(x, mask), self.norm2, 1e-3, mask)))
 
 
@@ -240,23 +253,23 @@ class ExplicitBranch(nn.Module):
         super().__init__()
         self.num_neighbors = num_neighbors
         self.embed = nn.Linear(2 * channels, channels)
-        self.embed_norm = nn.BatchNorm1d(channels)
+        self.embed_norm = BatchNorm(channels)
         self.spatial_attention = AttentionMap(num_neighbors, 3)
         self.neighbor_context = PointContext(channels)
         self.neighbor_attention = AttentionMap(channels, channels // 4)
         self.channel_context = PointContext(channels)
         self.channel_attention = AttentionMap(channels, channels // 4)
         self.ring = nn.Linear(3 * channels, channels)
-        self.ring_norm = nn.BatchNorm1d(channels)
+        self.ring_norm = BatchNorm(channels)
         self.gather = nn.Linear(num_neighbors // 3 * channels, channels)
-        self.gather_norm = nn.BatchNorm1d(channels)
+        self.gather_norm = BatchNorm(channels)
 
     def forward(self, features: Tensor, mask: Tensor | None) -> Tensor:
         batch, num_rows, channels = features.shape
         graph = self.edges(features, mask)  # (B,N,k,C)
 
         # One gate for each neighbour of each correspondence.
-        pooled = graph.mean(3) + graph.amax(3)  # (B,N,k)
+        pooled = graph.sum(3) / channels + graph.amax(3)  # (B,N,k)
         graph = graph * (1 + self.spatial_attention(pooled, mask))[..., None]
 
         # One gate for each channel of the j-th neighbour, common to all correspondences.
@@ -266,7 +279,7 @@ class ExplicitBranch(nn.Module):
 
         # One gate for each channel of each correspondence.
         context = self.channel_context(graph, mask)
-        pooled = context.mean(2) + context.amax(2)  # (B,N,C)
+        pooled = context.sum(2) / self.num_neighbors + context.amax(2)  # (B,N,C)
         graph = torch.addcmul(graph, context, self.channel_attention(pooled, mask)[:, :, None])
 
         # Annular convolution: neighbours in rings of three, then all rings.
@@ -287,9 +300,9 @@ class ExplicitBranch(nn.Module):
         return normalise(centre(edges, mask), self.embed_norm, 1e-5, mask)
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Implicit branch (section 3.4)
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 class OrderAwareFilter(nn.Module):
@@ -297,11 +310,11 @@ class OrderAwareFilter(nn.Module):
 
     def __init__(self, channels: int, num_clusters: int) -> None:
         super().__init__()
-        self.norm1 = nn.BatchNorm1d(channels)
+        self.norm1 = BatchNorm(channels)
         self.linear1 = nn.Linear(channels, channels)
-        self.cluster_norm = nn.BatchNorm1d(num_clusters)
+        self.cluster_norm = BatchNorm(num_clusters)
         self.cluster_linear = nn.Linear(num_clusters, num_clusters)
-        self.norm2 = nn.BatchNorm1d(channels)
+        self.norm2 = BatchNorm(channels)
         self.linear2 = nn.Linear(channels, channels)
 
     def forward(self, clusters: Tensor) -> Tensor:
@@ -316,10 +329,10 @@ class ImplicitBranch(nn.Module):
 
     def __init__(self, channels: int, num_clusters: int, num_filters: int) -> None:
         super().__init__()
-        self.pool_norm = nn.BatchNorm1d(channels)
+        self.pool_norm = BatchNorm(channels)
         self.pool = nn.Linear(channels, num_clusters)
         self.filters = nn.ModuleList(OrderAwareFilter(channels, num_clusters) for _ in range(num_filters))
-        self.unpool_norm = nn.BatchNorm1d(channels)
+        self.unpool_norm = BatchNorm(channels)
         self.unpool = nn.Linear(channels, num_clusters)
 
     def forward(self, features: Tensor, mask: Tensor | None) -> Tensor:
@@ -332,9 +345,9 @@ class ImplicitBranch(nn.Module):
         return assignment.softmax(2) @ clusters  # (B,N,C)
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Motion injection (section 3.5)
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 class MotionEmbedding(nn.Module):
@@ -343,9 +356,9 @@ class MotionEmbedding(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.linear1 = nn.Linear(2, channels // 4)
-        self.norm1 = nn.BatchNorm1d(channels // 4)
+        self.norm1 = BatchNorm(channels // 4)
         self.linear2 = nn.Linear(channels // 4, channels // 2)
-        self.norm2 = nn.BatchNorm1d(channels // 2)
+        self.norm2 = BatchNorm(channels // 2)
         self.linear3 = nn.Linear(channels // 2, channels)
 
     def forward(self, correspondences: Tensor, mask: Tensor | None) -> Tensor:
@@ -353,14 +366,6 @@ class MotionEmbedding(nn.Module):
         x = F.relu(linear_norm(x, self.linear1, self.norm1, mask))
         x = F.relu(linear_norm(x, self.linear2, self.norm2, mask))
         return self.linear3(x)
-
-
-class Projections(NamedTuple):
-    """Weights of one attention as applied to layer-normalised tokens, the affine part of the normalisations folded in."""
-
-    query: tuple[Tensor, Tensor]
-    key: tuple[Tensor, Tensor]
-    value: tuple[Tensor, Tensor]
 
 
 def fold(norm: nn.LayerNorm, linear: nn.Linear) -> tuple[Tensor, Tensor]:
@@ -421,53 +426,50 @@ class Attention(nn.Module):
         return self.output(out.transpose(1, 2).flatten(2))
 
     def _flow(
-        self,
-        q: Tensor,
-        k: Tensor,
-        context: Tensor,
-        value_weight: Tensor,
-        value_bias: Tensor,
-        mask: Tensor | None,
+        self, q: Tensor, k: Tensor, context: Tensor, value_weight: Tensor, value_bias: Tensor, mask: Tensor | None
     ) -> Tensor:
         """Flow attention: linear in N, with competition among sources and allocation to sinks.
 
-        With S = diag(competition) K, the paper's Q (S^T V) W_o is computed as Q ((S^T context) W_v W_o): values,
-        which nothing else needs, are never formed on N rows, and the two products after the sum over tokens become one.
+        With S = K diag(competition), the paper's Q (S^T V) W_o is computed as Q ((S^T context) W_v W_o): values,
+        which nothing else needs, are never formed on N rows, and the two products after the sum over tokens
+        become one.
         """
         heads = self.num_heads
         if mask is not None:
             q, k = q * mask[..., None], k * mask[..., None]
-        total_q, total_k = q.sum(1), k.sum(1)  # (B,C)
-        incoming = 1 / self._dot(q, total_k)  # (B,N,H)
-        outgoing = 1 / self._dot(k, total_q)
+        incoming = 1 / self._dot(q, k.sum(1))  # (B,H,N)
+        outgoing = 1 / self._dot(k, q.sum(1))
         sink = self._dot(q, self._weighted_sum(k, outgoing))
         source = self._dot(k, self._weighted_sum(q, incoming)).clamp(-1, 1)
-        count = row_count(k, mask)
-        # Sinks and sources are equally many here, so the published factor (number of sinks / sources) is one.
+        # Sinks and sources are equally many here, so the published factor of their numbers is one.
         allocation = sink.sigmoid()
-        competition = row_softmax(source, mask) * count  # (B,N,H)
+        if mask is not None:
+            source = source.masked_fill(~mask[:, None], -math.inf)
+        competition = source.softmax(2) * row_count(source.mT, mask)
 
-        weighted = (k.unflatten(-1, (heads, -1)) * competition[..., None].to(k.dtype)).flatten(2)  # (B,N,C)
+        weighted = self._scale_heads(k, competition)  # (B,N,C)
         summed = (weighted.mT @ context).unflatten(1, (heads, -1))  # (B,H,D,C)
         mass = weighted.sum(1).unflatten(-1, (heads, -1))[..., None]  # (B,H,D,1)
-        flow = summed @ value_weight.unflatten(0, (heads, -1)).mT + mass * value_bias.view(
-            heads, 1, -1
-        )  # (B,H,D,D)
-        flow = flow @ self.output.weight.mT.unflatten(0, (heads, -1))  # (B,H,D,C)
-        gated = (q.unflatten(-1, (heads, -1)) * (incoming * allocation)[..., None].to(q.dtype)).flatten(2)
-        return gated @ flow.flatten(1, 2) + self.output.bias
+        flow = summed @ value_weight.unflatten(0, (heads, -1)).mT + mass * value_bias.view(heads, 1, -1)
+        flow = flow @ self.output.weight.mT.unflatten(0, (heads, -1))  # (B,H,D,D) to (B,H,D,C)
+        gated = self._scale_heads(q, incoming * allocation)
+        return gated @ flow.flatten(1, 2).to(gated.dtype) + self.output.bias
 
     def _dot(self, x: Tensor, y: Tensor) -> Tensor:
-        """(x + eps) . (y + eps) + eps in each head: (B,N,C), (B,C) to (B,N,H)."""
+        """(x + eps) . (y + eps) + eps in each head: (B,N,C), (B,C) to (B,H,N)."""
         y = y.unflatten(-1, (self.num_heads, -1)) + FLOW_EPSILON  # (B,H,D)
-        columns = torch.diag_embed(y.transpose(1, 2)).transpose(1, 2)  # (B,H,D,H), zero outside its own head
-        constant = FLOW_EPSILON * y.sum(-1) + FLOW_EPSILON
-        return x @ columns.flatten(1, 2).to(x.dtype) + constant[:, None]
+        rows = torch.diag_embed(y.mT).permute(0, 2, 3, 1)  # (B,H,H,D): row h is zero outside head h
+        constant = FLOW_EPSILON * y.sum(-1, keepdim=True) + FLOW_EPSILON
+        return rows.flatten(2) @ x.mT + constant
 
     def _weighted_sum(self, x: Tensor, weight: Tensor) -> Tensor:
-        """Sum over tokens of x times the weight of its head: (B,N,C), (B,N,H) to (B,C)."""
-        every = (x.mT @ weight.to(x.dtype)).unflatten(1, (self.num_heads, -1))  # (B,H,D,H)
-        return every.diagonal(dim1=1, dim2=3).transpose(1, 2).flatten(1)
+        """Sum over tokens of x times the weight of its head: (B,N,C), (B,H,N) to (B,C)."""
+        every = (weight @ x).unflatten(-1, (self.num_heads, -1))  # (B,H,H,D)
+        return every.diagonal(dim1=1, dim2=2).mT.flatten(1)
+
+    def _scale_heads(self, x: Tensor, weight: Tensor) -> Tensor:
+        """Each head of each token times its weight: (B,N,C), (B,H,N) to (B,N,C)."""
+        return (x.unflatten(-1, (self.num_heads, -1)) * weight.mT[..., None].to(x.dtype)).flatten(2)
 
 
 class MotionInjectionLayer(nn.Module):
@@ -504,9 +506,9 @@ class MotionInjectionLayer(nn.Module):
         return x + self.layer_scale * self.contract(F.gelu(self.expand(x)))
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Two-view geometry (section 3.1, equation 3)
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 class SmallestEigenvector(torch.autograd.Function):
@@ -517,13 +519,13 @@ class SmallestEigenvector(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, matrix: Tensor) -> Tensor:  # type: ignore[no-untyped-def, override]
+    def forward(ctx: Any, matrix: Tensor) -> Tensor:
         values, vectors = torch.linalg.eigh(matrix)
         ctx.save_for_backward(values, vectors)
         return vectors[..., 0]
 
     @staticmethod
-    def backward(ctx, gradient: Tensor) -> Tensor:  # type: ignore[no-untyped-def, override]
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
         values, vectors = ctx.saved_tensors
         gap = values[..., :1] - values  # (...,n), zero or negative
         usable = gap.abs() > 1e-7 * values[..., -1:].abs()
@@ -580,9 +582,9 @@ def symmetric_epipolar_squared(correspondences: Tensor, matrix: Tensor) -> Tenso
         return algebraic.square() * (1 / (length1 + 1e-15) + 1 / (length0 + 1e-15))
 
 
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 # Network (section 3.2)
-# --------------------------------------------------------------------------------------------------------------------
+# ----------------------------------------------------------------------------------------------------------
 
 
 class FusionRound(nn.Module):
@@ -629,10 +631,10 @@ class PruningBlock(nn.Module):
 
     def __init__(
         self, *, input_channels: int, fusion_rounds: int, channels: int, motion: bool, **fusion
-    ) -> None:  # type: ignore[no-untyped-def]
+    ) -> None:
         super().__init__()
         self.stem = nn.Linear(input_channels, channels)
-        self.stem_norm = nn.BatchNorm1d(channels)
+        self.stem_norm = BatchNorm(channels)
         self.motion = MotionEmbedding(channels) if motion else None
         self.rounds = nn.ModuleList(
             FusionRound(channels=channels, motion=motion, **fusion) for _ in range(fusion_rounds)
@@ -659,9 +661,9 @@ class WeightHead(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.linear1 = nn.Linear(channels, channels)
-        self.norm1 = nn.BatchNorm1d(channels)
+        self.norm1 = BatchNorm(channels)
         self.linear2 = nn.Linear(channels, channels)
-        self.norm2 = nn.BatchNorm1d(channels)
+        self.norm2 = BatchNorm(channels)
         self.output = nn.Linear(channels, 2)
         # The published unit has this projection beside its shortcut and adds the input instead. It is here because
         # the published parameter counts include it; frozen, because no gradient ever reaches it.
@@ -780,7 +782,7 @@ class CorrAdaptor(nn.Module):
         channels: int,
         side_channels: int,
         estimate: str,
-        **layers,  # type: ignore[no-untyped-def]
+        **layers: Any,
     ) -> None:
         super().__init__()
         self.side_channels = side_channels
