@@ -13,7 +13,7 @@ import click
 from corrsfm.cli.options import echo_json, json_option, overwrite_option, run_options
 from corrsfm.config import RunConfig
 
-__all__ = ["evaluate"]
+__all__ = ["command_line", "evaluate"]
 
 FILTERS = (
     "nn, mutual, ratioT, ratioT+mutual (T such as 0.8), oracle (the right matches), or a method of "
@@ -33,7 +33,7 @@ def evaluate() -> None:
     """Measure methods and reconstructions."""
 
 
-def _command_line() -> str:
+def command_line() -> str:
     """The command as typed, for result files: the program by its name, not its place."""
     return shlex.join(["corrsfm", *sys.argv[1:]])
 
@@ -109,7 +109,7 @@ def pose(
         device=_device(run),
         threads=run.threads,
         overwrite=overwrite,
-        command=_command_line(),
+        command=command_line(),
         on_method=_method_bar,
     )
     _show({"kind": "pose", **values}, as_json)
@@ -150,7 +150,7 @@ def homography(
             device=_device(run),
             threads=run.threads,
             overwrite=overwrite,
-            command=_command_line(),
+            command=command_line(),
             on_sequence=advance,
         )
     _show({"kind": "homography", **values}, as_json)

@@ -25,6 +25,8 @@ _CHEIRALITY_RESIDUAL = 3e-5
 _LITERATURE_THRESHOLD = 1e-3
 _CONFIDENCE = 0.99999
 _MAX_ITERATIONS = 10000
+# OpenCV's default. Its old RANSAC solves every sample on one core for minutes if allowed more.
+_LITERATURE_ITERATIONS = 1000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,7 +144,7 @@ def _opencv(
             method=getattr(cv2, method),
             prob=_CONFIDENCE,
             threshold=threshold,
-            maxIters=_MAX_ITERATIONS,
+            maxIters=_LITERATURE_ITERATIONS if method == "RANSAC" else _MAX_ITERATIONS,
         )
     except cv2.error:
         # Some degenerate samples make USAC give up with an exception instead of an empty matrix.

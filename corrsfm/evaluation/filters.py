@@ -7,6 +7,7 @@ independent of a deep-matching framework. A class with ``name`` and ``__call__``
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from corrsfm.errors import ConfigError
 from corrsfm.oanet import OANetPair
 from corrsfm.types import PruneResult
 
-__all__ = ["OracleFilter", "PairFilter", "PrunerFilter", "SideFilter", "parse_filter"]
+__all__ = ["OracleFilter", "PairFilter", "PrunerFilter", "SideFilter", "parse_filter", "parse_prune_method"]
 
 
 class PairFilter(Protocol):
@@ -145,16 +146,40 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
     if side := _SIDE.fullmatch(text):
         ratio = float(side["ratio"]) if side["ratio"] else None
         return SideFilter(max_ratio=ratio, mutual=text.endswith("mutual"))
+    methods = [str(method) for method in PruneMethod]
+    if not (match := _PRUNER.fullmatch(text)) or match["method"] not in methods:
+        raise ConfigError(
+            f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, oracle, or "
+            f"METHOD[@POINT][:CHECKPOINT] with METHOD of {', '.join(methods)}"
+        )
+    config = parse_prune_method(text, PruneConfig())
+    return PrunerFilter(text, config, device=device, seed=seed, threads=threads)
+
+
+def parse_prune_method(text: str, base: PruneConfig) -> PruneConfig:
+    """Options of a method of `corrsfm prune` from ``METHOD[@POINT][:CHECKPOINT]``.
+
+    Parameters
+    ----------
+    text : str
+    base : PruneConfig
+        What the text does not say.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method or operating point.
+    """
     match = _PRUNER.fullmatch(text)
     methods, points = [str(m) for m in PruneMethod], [str(p) for p in OperatingPoint]
-    if not match or match["method"] not in methods or (match["point"] or points[0]) not in points:
+    if not match or match["method"] not in methods or match["point"] not in (None, *points):
         raise ConfigError(
-            f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, oracle, "
-            f"or METHOD[@POINT][:CHECKPOINT]: METHOD of {', '.join(methods)}; POINT of {', '.join(points)}"
+            f"no prune method '{text}'; expected METHOD[@POINT][:CHECKPOINT] with METHOD of "
+            f"{', '.join(methods)} and POINT of {', '.join(points)}"
         )
-    config = PruneConfig(
+    return dataclasses.replace(
+        base,
         method=PruneMethod(match["method"]),
-        operating_point=OperatingPoint(match["point"] or PruneConfig().operating_point),
-        model=Path(match["model"]) if match["model"] else None,
+        operating_point=OperatingPoint(match["point"]) if match["point"] else base.operating_point,
+        model=Path(match["model"]) if match["model"] else base.model,
     )
-    return PrunerFilter(text, config, device=device, seed=seed, threads=threads)

@@ -1,0 +1,69 @@
+"""The command that compares prune methods by whole reconstructions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from corrsfm.cli.evaluate import command_line
+from corrsfm.cli.options import echo_json, json_option, overwrite_option, pipeline_options
+from corrsfm.config import PipelineConfig
+
+__all__ = ["compare"]
+
+PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("images_dir", metavar="IMAGES", type=PATH)
+@click.option(
+    "--methods",
+    default="ratio,loransac,magsac,corradaptor,cascade",
+    show_default=True,
+    help="Prune methods with commas between; each METHOD[@sfm|@pose][:CHECKPOINT].",
+)
+@click.option(
+    "--output",
+    type=PATH,
+    help="Folder for workspaces, compare.json and compare.html. [default: compare_IMAGES]",
+)
+@click.option("--ground-truth", type=PATH, help="COLMAP model or folder of camera files to measure against.")
+@click.option("--results", type=PATH, help="Also write the result file here.")
+@pipeline_options
+@overwrite_option
+@json_option
+def compare(
+    images_dir: Path,
+    methods: str,
+    output: Path | None,
+    ground_truth: Path | None,
+    results: Path | None,
+    config: PipelineConfig,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    """Reconstruct the same photos with several prune methods and compare.
+
+    Features and matches are made once. The table goes to standard output, the page with the pairs that differ
+    most to OUTPUT/compare.html.
+    """
+    from corrsfm.evaluation.compare import compare_methods
+    from corrsfm.evaluation.tables import render_table
+
+    output = output or Path(f"compare_{images_dir.resolve().name}")
+    values = compare_methods(
+        images_dir,
+        output,
+        [method.strip() for method in methods.split(",")],
+        config,
+        ground_truth=ground_truth,
+        results=results,
+        overwrite=overwrite,
+        command=command_line(),
+    )
+    if as_json:
+        echo_json(values)
+    else:
+        click.echo(render_table({"kind": "compare", **values}))
+        click.echo(f"\npage: {output / 'compare.html'}")
