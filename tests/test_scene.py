@@ -53,6 +53,7 @@ def test_missing_photos_are_failures_of_their_pairs(truth_dir: Path, tmp_path: P
 
 def test_workspace_stands_for_its_largest_model(truth_dir: Path, tmp_path: Path):
     (tmp_path / "sparse").mkdir()
+    (tmp_path / "images.txt").write_text("the list of photos of a workspace\n")
     model = _moved(truth_dir, tmp_path / "sparse" / "0")
     assert find_model(tmp_path) == find_model(tmp_path / "sparse") == find_model(model) == model
     assert evaluate_scene(tmp_path, truth_dir).num_registered == 8

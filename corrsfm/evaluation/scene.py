@@ -17,7 +17,6 @@ from corrsfm.evaluation.metrics import Pose, pose_auc, position_errors, relative
 __all__ = ["SCENE_THRESHOLDS_DEG", "SceneScore", "evaluate_scene", "find_model", "read_poses", "score_poses"]
 
 SCENE_THRESHOLDS_DEG = (1.0, 5.0, 10.0)
-_MODEL_FILES = ("images.bin", "images.txt")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +58,13 @@ class SceneScore:
         return dataclasses.asdict(self)
 
 
+def _is_model(folder: Path) -> bool:
+    # A workspace has an images.txt too, the list of its photos.
+    return any(
+        (folder / f"cameras{s}").exists() and (folder / f"images{s}").exists() for s in (".bin", ".txt")
+    )
+
+
 def find_model(folder: Path) -> Path:
     """The model in a folder: itself, or the largest one of a workspace (``sparse/0``).
 
@@ -68,7 +74,7 @@ def find_model(folder: Path) -> Path:
         If there is none.
     """
     for candidate in (folder, folder / "sparse" / "0", folder / "0"):
-        if any((candidate / name).exists() for name in _MODEL_FILES):
+        if _is_model(candidate):
             return candidate
     raise InputError(
         f"{folder}: holds no COLMAP model (images.bin or images.txt) and no sparse/0; "
@@ -95,7 +101,7 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     InputError
         If there is neither, or a file is damaged.
     """
-    if any((folder / name).exists() for name in _MODEL_FILES):
+    if _is_model(folder):
         return _read_colmap(folder)
     files = sorted(folder.rglob("*.json")) if folder.is_dir() else []
     if not files:
