@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,10 +87,7 @@ def reconstruct(
             options=_incremental_options(config, output, seed, num_threads),
             on_progress=on_progress or (lambda num_registered: None),
         )
-        models = sorted(
-            (model for model in mapped.values() if model.num_reg_images() > 1),
-            key=lambda model: (-model.num_reg_images(), -model.num_points3D(), _first_name(model)),
-        )
+        models = _ranked(mapped.values(), config.min_model_size)
         if not models:
             raise ReconstructionError(f"{database}: {_why_no_model(graph)}")
         for number, model in enumerate(models):
@@ -202,6 +199,17 @@ def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:
     if "error" in outcome:
         raise outcome["error"]
     return outcome["result"]
+
+
+def _ranked(models: Iterable[pycolmap.Reconstruction], min_model_size: int) -> list[pycolmap.Reconstruction]:
+    """The models that count, the largest first; the first one counts whatever its size."""
+
+    def rank(model: pycolmap.Reconstruction) -> tuple[int, int, str]:
+        return -model.num_reg_images(), -model.num_points3D(), _first_name(model)
+
+    ranked = sorted((model for model in models if model.num_reg_images() > 1), key=rank)
+    # The mappers do not always obey their option of this name.
+    return ranked[:1] + [model for model in ranked[1:] if model.num_reg_images() >= min_model_size]
 
 
 def _first_name(model: pycolmap.Reconstruction) -> str:

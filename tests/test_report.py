@@ -165,7 +165,8 @@ def test_table_is_aligned_and_complete() -> None:
             "not registered",
             "  d.jpg  no pair                    it was not matched with any photo",
             "  e.jpg  no putative match          no match in 1 pair; it may have no keypoints",
-            "  f.jpg  pruned to nothing          no match kept in 2 pairs; most putative ones: 120 with a.jpg",
+            "  f.jpg  pruned to nothing          "
+            "no match kept in 2 pairs; most putative ones: 120 with a.jpg",
             "  g.jpg  too few verified matches   none of 1 pair verified; most kept: 9 with a.jpg",
             "  h.jpg  in another model           one of 2 photos of model 1",
             "  i.jpg  in another model           one of 2 photos of model 1",

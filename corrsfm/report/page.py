@@ -1,0 +1,283 @@
+"""One HTML page about a scene that needs nothing but itself: statistics, pictures and the model in 3-D."""
+
+from __future__ import annotations
+
+import html
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.colmap import observation_errors
+from corrsfm.errors import DependencyError
+from corrsfm.report import charts, pictures
+from corrsfm.report.model_view import ModelView, make_view, plotly_view
+from corrsfm.report.scene import MissingImage, SceneReport
+from corrsfm.report.style import STYLE
+from corrsfm.report.table import statistics_rows
+from corrsfm.types import PairStatistics
+from corrsfm.workspace import atomic_write_text
+
+__all__ = ["LoadMatches", "write_html"]
+
+LoadMatches = Callable[[str, str], tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]]
+"""Names of a pair → its putative matches: points in photo 0 and in photo 1, (M, 2) float32 pixels in COLMAP's
+convention, and (M,) bool, the matches that pruning kept."""
+
+_DRAWN_PAIRS = 3
+_DRAWN_SIZE = 560
+_THUMBNAILS = 24
+_THUMBNAIL_SIZE = 120
+_LISTED_PAIRS = 300
+
+# Nothing may be loaded from anywhere; plotly compiles its shaders' glue code at run time.
+_POLICY = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:"
+)
+
+
+def write_html(
+    report: SceneReport,
+    path: Path,
+    *,
+    model: pycolmap.Reconstruction | None = None,
+    images_dir: Path | None = None,
+    load_matches: LoadMatches | None = None,
+) -> None:
+    """Write the page; it appears at ``path`` whole or not at all.
+
+    Parameters
+    ----------
+    report : SceneReport
+    path : Path
+        The HTML file.
+    model : pycolmap.Reconstruction, optional
+        The first model, for the 3-D view and two histograms. Without plotly the view is a still picture.
+    images_dir : Path, optional
+        Folder of the photos, for drawn matches and thumbnails; missing photos are left out.
+    load_matches : callable, optional
+        Gives the matches to draw.
+
+    Raises
+    ------
+    WorkspaceError
+        If the page cannot be written.
+    """
+    sections = [
+        _tiles(report),
+        _missing(report, images_dir),
+        _section("Model", _model_view(make_view(model))) if model is not None else "",
+        _section("Statistics", _statistics(report)),
+        _section("Distributions", _histograms(report, model)),
+        _section("View graph", _view_graph(report)),
+        _section("Matches", _matches(report, images_dir, load_matches)),
+        _section("Run", _run(report)),
+    ]
+    title = html.escape(report.scene)
+    text = (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{title} · corrsfm</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        f"<header><h1>{title}</h1><p>{_subtitle(report)}</p></header>\n<main>\n"
+        + "\n".join(section for section in sections if section)
+        + "\n</main>\n</body>\n</html>\n"
+    )
+    atomic_write_text(path, text)
+
+
+def _subtitle(report: SceneReport) -> str:
+    method = report.configuration.get("prune", {}).get("method")
+    made_by = f"corrsfm {report.versions['corrsfm']}" if "corrsfm" in report.versions else "corrsfm"
+    return html.escape(f"Reconstruction by {made_by}" + (f", matches pruned by {method}" if method else ""))
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>\n{body}\n</section>" if body else ""
+
+
+def _tiles(report: SceneReport) -> str:
+    """The four numbers that are looked for first."""
+    tiles = [
+        ("photos registered", f"{report.num_registered} / {len(report.image_names)}"),
+        ("pairs verified", f"{report.num_verified_pairs:,} / {len(report.pairs):,}"),
+    ]
+    if report.models:
+        model = report.models[0]
+        tiles += [
+            ("points", f"{model.num_points:,}"),
+            ("median reprojection error", f"{model.median_error_px:.2f} px"),
+        ]
+    if report.stage_seconds:
+        tiles.append(("seconds", f"{sum(report.stage_seconds.values()):,.0f}"))
+    cells = "".join(f"<div><b>{value}</b><span>{label}</span></div>" for label, value in tiles)
+    return f'<div class="tiles">{cells}</div>'
+
+
+def _statistics(report: SceneReport) -> str:
+    rows = "".join(
+        f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>"
+        for label, value in statistics_rows(report)
+        if label not in ("scene", "seconds")
+    )
+    table = f'<div class="scroll"><table class="facts">{rows}</table></div>'
+    if len(report.models) < 2:
+        return table
+    models = "".join(
+        f"<tr><td>sparse/{number}</td><td>{model.num_images:,}</td><td>{model.num_points:,}</td>"
+        f"<td>{model.mean_track_length:.2f}</td><td>{model.median_error_px:.2f}</td></tr>"
+        for number, model in enumerate(report.models)
+    )
+    return (
+        f'{table}\n<div class="scroll"><table class="numbers"><tr><th>model</th><th>photos</th>'
+        f"<th>points</th><th>track length</th><th>median error, px</th></tr>{models}</table></div>"
+    )
+
+
+def _missing(report: SceneReport, images_dir: Path | None) -> str:
+    if not report.missing:
+        return ""
+    rows = "".join(
+        _missing_row(image, images_dir if index < _THUMBNAILS else None)
+        for index, image in enumerate(report.missing)
+    )
+    noun = "photo is" if len(report.missing) == 1 else "photos are"
+    return _section(
+        f"{len(report.missing)} {noun} not registered",
+        f'<div class="scroll tall"><table class="missing">{rows}</table></div>',
+    )
+
+
+def _missing_row(image: MissingImage, images_dir: Path | None) -> str:
+    photo = pictures.read_photo(images_dir / image.name, _THUMBNAIL_SIZE) if images_dir else None
+    thumbnail = f'<img src="{pictures.jpeg_uri(photo[0])}" alt="">' if photo is not None else ""
+    return (
+        f"<tr><td>{thumbnail}</td><td>{html.escape(image.name)}</td>"
+        f"<td><b>{html.escape(image.reason)}</b><br>{html.escape(image.detail)}</td></tr>"
+    )
+
+
+def _model_view(view: ModelView) -> str:
+    shown = f"{len(view.points):,} points and {len(view.names):,} cameras"
+    try:
+        drawn = f'<div class="model">{plotly_view(view)}</div>'
+        note = f"{shown}. Drag to turn, scroll to zoom; point at a camera to read its photo's name."
+    except DependencyError as error:
+        picture = pictures.draw_views(view.points, view.colours, view.centres)
+        drawn = (
+            f'<img class="wide" src="{pictures.png_uri(picture)}" alt="the model from above and the side">'
+        )
+        note = f"{shown}, from above and from the side. {html.escape(str(error))}."
+    return f'{drawn}\n<p class="note">{note}</p>'
+
+
+def _histograms(report: SceneReport, model: pycolmap.Reconstruction | None) -> str:
+    drawn = []
+    if model is not None and model.num_points3D():
+        lengths = np.array([point.track.length() for point in model.points3D.values()])
+        longest = int(np.clip(lengths.max(), 4, 30))
+        edges = np.arange(2, longest + 2, dtype=np.float64)
+        drawn.append(charts.histogram(lengths, edges, "track length, photos a point", "points"))
+        errors = observation_errors(model)
+        # Bins of 0.05 px for good models, wider ones for others; the limits stay round numbers.
+        step = 0.05 * max(1, np.ceil(np.percentile(errors, 99) / 1.5))
+        edges = np.round(step * np.arange(31), 2)
+        drawn.append(charts.histogram(errors, edges, "reprojection error, px", "observations"))
+    ratios = [pair.num_verified / pair.num_pruned for pair in report.pairs if pair.num_pruned]
+    if ratios:
+        edges = np.linspace(0, 1, 21)
+        drawn.append(charts.histogram(ratios, edges, "inlier ratio of pruned matches", "pairs"))
+    if not drawn:
+        return ""
+    return '<div class="charts">' + "".join(f"<figure>{chart}</figure>" for chart in drawn) + "</div>"
+
+
+def _view_graph(report: SceneReport) -> str:
+    if not report.pairs:
+        return "<p>No pair of photos was matched.</p>"
+    uri = pictures.png_uri(pictures.draw_view_graph(report.image_names, report.pairs))
+    low, high = pictures.view_graph_scale(report.pairs)
+    ramp = pictures.png_uri(pictures.shade(np.linspace(0, 1, 128)[None]))
+    names = "".join(f"<li>{html.escape(name)}</li>" for name in report.image_names[:1000])
+    return (
+        f'<div class="graph"><figure>{charts.matrix(uri, report.image_names)}</figure><div>'
+        "<p>Rows and columns are photos in order of their names; each cell is a pair.</p>"
+        f'<p class="legend">verified matches <span>{low:,}</span><img src="{ramp}" alt="pale to dark">'
+        f"<span>{high:,}</span></p>"
+        '<p class="legend"><i class="grey"></i> matched, not verified</p>'
+        '<p class="legend"><i class="white"></i> not matched</p>'
+        f"<details><summary>Numbers and names</summary><ol>{names}</ol></details></div></div>"
+    )
+
+
+def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMatches | None) -> str:
+    drawn = []
+    if images_dir is not None and load_matches is not None:
+        for kind, pair in _pairs_to_draw(report.pairs):
+            figure = _drawn_pair(kind, pair, images_dir, load_matches)
+            if figure:
+                drawn.append(figure)
+    legend = (
+        f'<p class="legend"><i style="background:{pictures.KEPT_COLOUR}"></i> kept by pruning '
+        f'<i style="background:{pictures.DROPPED_COLOUR}"></i> dropped; '
+        "at most 150 and 60 lines are drawn</p>"
+    )
+    listed = sorted(report.pairs, key=lambda pair: -pair.num_verified)[:_LISTED_PAIRS]
+    if not listed:
+        return ""
+    rows = "".join(
+        f"<tr><td>{html.escape(pair.name0)}</td><td>{html.escape(pair.name1)}</td>"
+        f"<td>{pair.num_putative:,}</td><td>{pair.num_pruned:,}</td><td>{pair.num_verified:,}</td></tr>"
+        for pair in listed
+    )
+    head = "<tr><th>photo 0</th><th>photo 1</th><th>putative</th><th>pruned</th><th>verified</th></tr>"
+    count = f"All {len(report.pairs):,} pairs"
+    if len(listed) < len(report.pairs):
+        count = f"The best {len(listed):,} of {len(report.pairs):,} pairs; all are in report.json"
+    return (
+        (legend + f'<div class="pairs">{"".join(drawn)}</div>' if drawn else "")
+        + f'\n<details><summary>{count}</summary><div class="scroll tall">'
+        + f'<table class="numbers names">{head}{rows}</table></div></details>'
+    )
+
+
+def _pairs_to_draw(pairs: Sequence[PairStatistics]) -> list[tuple[str, PairStatistics]]:
+    """Three of the strongest and the three weakest verified pairs, the strongest ones of different photos."""
+    ranked = sorted((pair for pair in pairs if pair.num_verified > 0), key=lambda pair: -pair.num_verified)
+    strong: list[PairStatistics] = []
+    seen: set[str] = set()
+    for pair in ranked:
+        if len(strong) < _DRAWN_PAIRS and not seen & {pair.name0, pair.name1}:
+            strong.append(pair)
+            seen |= {pair.name0, pair.name1}
+    weak = [pair for pair in ranked if pair not in strong][-_DRAWN_PAIRS:]
+    return [("strong", pair) for pair in strong] + [("weak", pair) for pair in weak]
+
+
+def _drawn_pair(kind: str, pair: PairStatistics, images_dir: Path, load_matches: LoadMatches) -> str:
+    photos = [pictures.read_photo(images_dir / name, _DRAWN_SIZE) for name in (pair.name0, pair.name1)]
+    if photos[0] is None or photos[1] is None:
+        return ""
+    points0, points1, kept = load_matches(pair.name0, pair.name1)
+    (photo0, scale0), (photo1, scale1) = photos[0], photos[1]
+    drawn = pictures.draw_matches((photo0, photo1), (scale0, scale1), (points0, points1), kept)
+    names = html.escape(f"{pair.name0} – {pair.name1}")
+    return (
+        f'<figure><img class="wide" src="{pictures.jpeg_uri(drawn)}" alt=""><figcaption>'
+        f"<b>{kind}</b> {names}: {pair.num_putative:,} putative, "
+        f"{pair.num_pruned:,} pruned, {pair.num_verified:,} verified</figcaption></figure>"
+    )
+
+
+def _run(report: SceneReport) -> str:
+    seconds = list(report.stage_seconds.items())
+    body = f'<figure class="bars">{charts.bars(seconds, "s")}</figure>' if seconds else ""
+    facts = {"configuration": report.configuration, "versions": report.versions}
+    if any(facts.values()):
+        text = html.escape(json.dumps(facts, indent=2, ensure_ascii=False, default=str))
+        body += f"<details><summary>Options and versions</summary><pre>{text}</pre></details>"
+    return body

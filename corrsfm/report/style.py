@@ -1,0 +1,65 @@
+"""The look of the page: dark on light, from a phone to a wide screen, on paper, too."""
+
+STYLE = """
+:root { --ink: #22262b; --quiet: #5c6670; --line: #d9d7d0; --paper: #faf9f6; --card: #ffffff;
+  --bar: #2f6f9f; }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.5 system-ui, -apple-system,
+  "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
+header, main { max-width: 1080px; margin: 0 auto; padding: 0 20px; }
+header { padding-top: 28px; }
+h1 { font-size: 1.9rem; line-height: 1.2; margin: 0; overflow-wrap: anywhere; }
+header p, .note, figcaption { color: var(--quiet); font-size: .9rem; margin: 4px 0 0; }
+figcaption b { color: var(--ink); font-weight: 600; margin-right: 4px; }
+h2 { font-size: 1.15rem; margin: 0 0 12px; }
+section { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 18px 20px;
+  margin: 18px 0; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px;
+  margin: 18px 0; }
+.tiles div { background: var(--card); border: 1px solid var(--line); border-radius: 8px; padding: 12px 16px; }
+.tiles b { display: block; font-size: 1.55rem; line-height: 1.25; font-variant-numeric: tabular-nums; }
+.tiles span { color: var(--quiet); font-size: .85rem; }
+.scroll { overflow-x: auto; }
+.tall { max-height: 480px; overflow-y: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-bottom: 1px solid #eceae4; }
+tr:last-child > * { border-bottom: 0; }
+th { font-weight: 500; color: var(--quiet); white-space: nowrap; }
+.numbers { margin-top: 14px; }
+.numbers th, .numbers td { text-align: right; }
+.numbers th:first-child, .numbers td:first-child, .names th:nth-child(2), .names td:nth-child(2) {
+  text-align: left; }
+.missing { width: 100%; }
+.missing td:first-child { width: 1%; }
+.missing td:nth-child(2) { overflow-wrap: anywhere; }
+.missing img { display: block; max-width: 96px; max-height: 72px; border-radius: 4px; }
+.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(280px, 1fr)); gap: 16px; }
+.pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 18px; }
+.graph { display: grid; grid-template-columns: minmax(0, 540px) minmax(220px, 1fr); gap: 24px; }
+figure { margin: 0; }
+.bars { max-width: 600px; }
+svg { display: block; width: 100%; height: auto; }
+svg .bar { fill: var(--bar); }
+svg .grid { stroke: #e6e4dd; }
+svg .frame { fill: none; stroke: var(--line); }
+svg .tick { font-size: 11px; fill: var(--quiet); }
+svg .axis { font-size: 12.5px; fill: var(--ink); }
+.wide { display: block; width: 100%; height: auto; border-radius: 4px; }
+.model { border: 1px solid var(--line); border-radius: 6px; overflow: hidden; }
+.legend { color: var(--quiet); font-size: .9rem; margin: 8px 0; }
+.legend img { width: 110px; height: 12px; margin: 0 6px; vertical-align: -1px; border-radius: 2px; }
+.legend i { display: inline-block; width: 14px; height: 14px; vertical-align: -2px; border-radius: 3px;
+  margin: 0 4px 0 8px; border: 1px solid rgba(0, 0, 0, .15); }
+.legend i:first-child { margin-left: 0; }
+.grey { background: #dedede; }
+.white { background: #ffffff; }
+summary { cursor: pointer; color: var(--quiet); padding: 6px 0; }
+ol, pre { font-size: .85rem; overflow: auto; max-height: 320px; overflow-wrap: anywhere; }
+@media (max-width: 720px) {
+  header, main { padding-left: 12px; padding-right: 12px; }
+  section { padding: 14px 12px; }
+  .graph { grid-template-columns: minmax(0, 1fr); }
+  .facts th { white-space: normal; }
+}
+@media print { section { break-inside: avoid; } body { background: #ffffff; } }
+"""
