@@ -1,17 +1,22 @@
-"""What this process may use of the machine: threads and a device."""
+"""What this process runs on: threads, a device, versions."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import itertools
 import os
+import platform
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
+from corrsfm import __version__
 from corrsfm.config import RunConfig
 from corrsfm.errors import ConfigError
 
-__all__ = ["device_of", "threaded", "threads_of", "use_threads"]
+__all__ = ["device_of", "threaded", "threads_of", "use_threads", "versions"]
+
+RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
 
 K = TypeVar("K")
 R = TypeVar("R")
@@ -68,3 +73,14 @@ def threaded(work: Callable[[K], R], keys: Iterable[K], run: RunConfig) -> Itera
         finally:
             for _, future in waiting:
                 future.cancel()
+
+
+def versions() -> dict[str, str]:
+    """Versions of corrsfm, Python and the packages that results depend on."""
+    found = {"corrsfm": __version__, "python": platform.python_version()}
+    for package in RECORDED_PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            found[package] = "unknown"
+    return found

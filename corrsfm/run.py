@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import platform
 import time
 from pathlib import Path
 from typing import Any
 
-from corrsfm import __version__, pipeline
 from corrsfm import config as cfg
+from corrsfm import pipeline
 from corrsfm.errors import ReconstructionError
 from corrsfm.index import read_index
+from corrsfm.machine import versions
 from corrsfm.resume import StageOutcome
 from corrsfm.workspace import STAGE_COMMANDS, Workspace, atomic_write_json
 
-__all__ = ["run_scene", "versions"]
-
-RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
+__all__ = ["run_scene"]
 
 
 def run_scene(
@@ -60,17 +58,6 @@ def run_scene(
         atomic_write_json(workspace.run_json, _run_record(workspace, config))
         pipeline.report(workspace, html=True)
     return outcomes
-
-
-def versions() -> dict[str, str]:
-    """Versions of corrsfm, Python and the packages that results depend on."""
-    found = {"corrsfm": __version__, "python": platform.python_version()}
-    for package in RECORDED_PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "unknown"
-    return found
 
 
 def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, Any]:
