@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray

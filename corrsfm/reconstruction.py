@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
 import pycolmap
 
 from corrsfm.colmap import colmap_log, database_errors, summarise_model
