@@ -141,6 +141,10 @@ def explain(workspace: Workspace, stage: str, config: Any) -> None:
     logger.info("%s: redone where needed (%s)", stage, reason)
 
 
+def _shown(value: object) -> str:
+    return "+".join(value) if isinstance(value, list) else str(value)
+
+
 def explain_photos(workspace: Workspace, index: Index) -> None:
     """Say which photos changed since the workspace last saw them."""
     if workspace.record_of("images") is None:
