@@ -135,7 +135,7 @@ def compare_methods(
     values = {
         "provenance": provenance(seed=config.run.seed, command=command, device=config.run.device),
         "subject": {
-            "name": images_dir.name,
+            "name": _scene_name(images_dir),
             "num_photos": len(index.records),
             "num_pairs": len(read_pairs(base)),
             "photos_sha256": {record.name: record.sha256 for record in index.records},
@@ -149,6 +149,12 @@ def compare_methods(
             save_results(path, "compare", values)
     write_page(output / "compare.html", values, base, workspaces)
     return values
+
+
+def _scene_name(images_dir: Path) -> str:
+    """The folder's name; of ``SCENE/images`` the scene's."""
+    folder = images_dir.resolve()
+    return folder.parent.name if folder.name == "images" and folder.parent.name else folder.name
 
 
 def _prepare(base: Workspace, images_dir: Path, config: PipelineConfig, overwrite: bool) -> None:

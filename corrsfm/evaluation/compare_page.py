@@ -25,10 +25,11 @@ _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
 body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem }
 table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; white-space: nowrap }
+th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom }
 th:first-child, td:first-child { text-align: left }
 .best { font-weight: 600 }
-.failure { color: #a33; white-space: normal; text-align: left }
+.failure { color: #a33 } td.failure { text-align: left }
+.wide { overflow-x: auto }
 .pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(24rem, 1fr)); gap: 1rem }
 figure { margin: 0 } img { max-width: 100% } figcaption, .note { color: #555; font-size: .9em }
 .kept { color: #2a7fb8 } .dropped { color: #d55e00 }
@@ -108,7 +109,7 @@ def _table(methods: dict[str, Any]) -> str:
             rows.append(
                 f"<tr><td class='failure' colspan='{len(columns) + 1}'>{escape(method['failure'])}</td></tr>"
             )
-    return f"<table><tr><th>method</th>{head}</tr>{''.join(rows)}</table>"
+    return f"<div class='wide'><table><tr><th>method</th>{head}</tr>{''.join(rows)}</table></div>"
 
 
 def _best(numbers: Sequence[float | None], sense: int) -> float | None:
