@@ -135,7 +135,9 @@ def explain(workspace: Workspace, stage: str, config: Any) -> None:
         return
     new = cfg.to_dict(config)
     changes = [
-        f"{key} {record.config.get(key)} → {new[key]}" for key in new if record.config.get(key) != new[key]
+        f"{key} {_shown(record.config.get(key))} → {_shown(new[key])}"
+        for key in new
+        if record.config.get(key) != new[key]
     ]
     reason = ", ".join(changes) if changes else "what it depends on changed"
     logger.info("%s: redone where needed (%s)", stage, reason)
