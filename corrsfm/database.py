@@ -101,20 +101,13 @@ def write_database(
     with atomic_path(path) as temporary:
         for suffix in ("-wal", "-shm"):
             temporary.with_name(temporary.name + suffix).unlink(missing_ok=True)
-        # Only quiet here: `verify_database` keeps the log.
-        with colmap_log(), database_errors(temporary):
+        with colmap_log(), database_errors(temporary, path):
             num_duplicates, num_empty = _fill(
                 temporary, images, cameras, features, pruned, config.write_descriptors
             )
-        verify_database(
-            temporary,
-            min_num_inliers=config.min_num_inliers,
-            max_error_px=config.verification_error_px,
-            seed=seed,
-            num_threads=num_threads,
-            log_file=log_file,
-        )
-        with colmap_log(), database_errors(temporary), pycolmap.Database.open(temporary) as database:
+        with colmap_log(log_file), database_errors(temporary, path):
+            _verify(temporary, config.min_num_inliers, config.verification_error_px, seed, num_threads)
+        with colmap_log(), database_errors(temporary, path), pycolmap.Database.open(temporary) as database:
             # A pair whose verification failed has a row without inliers.
             _, num_inliers = database.read_two_view_geometry_num_inliers()
             summary = DatabaseSummary(
@@ -159,19 +152,23 @@ def verify_database(
     """
     if not path.exists():
         raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    with colmap_log(log_file), database_errors(path):
+        with pycolmap.Database.open(path) as database:
+            database.clear_two_view_geometries()
+        _verify(path, min_num_inliers, max_error_px, seed, num_threads)
+
+
+def _verify(path: Path, min_num_inliers: int, max_error_px: float, seed: int, num_threads: int) -> None:
     options = pycolmap.TwoViewGeometryOptions()
     options.min_num_inliers = min_num_inliers
     options.ransac.max_error = max_error_px
     options.ransac.random_seed = seed
-    with colmap_log(log_file), database_errors(path):
-        with pycolmap.Database.open(path) as database:
-            database.clear_two_view_geometries()
-        pycolmap.geometric_verification(
-            path,
-            pycolmap.GeometricVerifierOptions(num_threads=num_threads or -1),
-            pycolmap.ExistingMatchedPairingOptions(batch_size=_PAIRS_PER_BATCH),
-            options,
-        )
+    pycolmap.geometric_verification(
+        path,
+        pycolmap.GeometricVerifierOptions(num_threads=num_threads or -1),
+        pycolmap.ExistingMatchedPairingOptions(batch_size=_PAIRS_PER_BATCH),
+        options,
+    )
 
 
 def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[VerifiedPair]:

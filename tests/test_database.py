@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from corrsfm.colmap import colmap_log
+from corrsfm.colmap import colmap_log, database_errors
 from corrsfm.config import DatabaseConfig
 from corrsfm.database import DatabaseSummary, read_verified_pairs, verify_database, write_database
 from corrsfm.errors import DatabaseError, InputError
@@ -44,6 +44,21 @@ def scene_features(seed: int = 0) -> dict[str, Features]:
             image_size=(640, 480),
         )
     return features
+
+
+def big_features() -> dict[str, Features]:
+    """Features whose keypoints take half a megabyte an image."""
+    return {
+        name: Features(
+            keypoints=np.tile(features.keypoints, (500, 1)),
+            scales=np.ones(30_000, np.float32),
+            orientations=np.zeros(30_000, np.float32),
+            scores=np.ones(30_000, np.float32),
+            descriptors=np.zeros((30_000, 128), np.uint8),
+            image_size=(640, 480),
+        )
+        for name, features in scene_features().items()
+    }
 
 
 def images(names: tuple[str, ...] = NAMES) -> list[ImageRecord]:
@@ -308,6 +323,52 @@ def test_database_open_in_another_process_is_not_replaced(tmp_path: Path, hold) 
     with pytest.raises(DatabaseError, match="in use"):
         write(path)
     assert path.read_bytes() == before
+
+
+FULL_DISK = """
+import resource, sys
+sys.path.insert(0, sys.argv[1])
+import test_database as t
+from pathlib import Path
+path = Path(sys.argv[2])
+# A limit on the size of files fails like a disk that fills up.
+resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, 250_000))
+try:
+    features = t.big_features().__getitem__
+    t.write(path, features=features)
+except t.DatabaseError as error:
+    print(error)
+"""
+
+
+def test_disk_that_fills_up_is_said_and_leaves_the_old_database(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write(path)
+    before = path.read_bytes()
+    arguments = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent), str(path)]
+    output = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout
+    assert output == f"{path}: the disk is full or failing; free some space and run the same command again\n"
+    assert path.read_bytes() == before
+    assert files(tmp_path) == ["database.db"]
+
+
+@pytest.mark.parametrize(
+    ("message", "told"),
+    [
+        ("[database_sqlite.cc:1350] SQLite error: database or disk is full", "the disk is full"),
+        ("[database_sqlite.cc:1350] SQLite error: database is locked", "in use by another program"),
+        ("SQLite error: attempt to write a readonly database", "check the permissions"),
+        ("SQLite error: constraint failed", "constraint failed; delete the file"),
+    ],
+)
+def test_failures_of_the_database_are_translated(tmp_path: Path, message: str, told: str) -> None:
+    with pytest.raises(DatabaseError, match=told), database_errors(tmp_path / "database.db"):
+        raise RuntimeError(message)
+
+
+def test_other_failures_are_not_blamed_on_the_database(tmp_path: Path) -> None:
+    with pytest.raises(RuntimeError, match="bundle"), database_errors(tmp_path / "database.db"):
+        raise RuntimeError("bundle adjustment went wrong")
 
 
 def test_file_that_is_no_database_is_not_replaced(tmp_path: Path) -> None:

@@ -125,7 +125,7 @@ def test_page_needs_neither_plotly_nor_photos(model, tmp_path: Path, monkeypatch
     path = tmp_path / "report.html"
     write_html(report_of(model), path, model=model, images_dir=tmp_path / "gone", load_matches=matches(model))
     text = page(path)
-    assert "pip install &#x27;corrsfm[report]&#x27;" in text
+    assert "pip install 'corrsfm[report]'" in text
     assert "<script" not in text
     assert path.stat().st_size < 3e5
     encoded = re.search(r'class="wide" src="data:image/png;base64,([^"]+)"', text)

@@ -59,7 +59,7 @@ def run(database: Path, output: Path, images_dir: Path | None = None, **options)
 
 
 @pytest.mark.parametrize("mapper", list(Mapper))
-def test_every_mapper_recovers_the_synthetic_scene(tmp_path: Path, mapper: Mapper, capfd) -> None:
+def test_every_mapper_recovers_the_synthetic_scene(tmp_path: Path, mapper: Mapper) -> None:
     truth = synthesize(tmp_path / "database.db")
     (summary,) = run(tmp_path / "database.db", tmp_path / "sparse", mapper=mapper)
     assert summary.num_images == 10
@@ -75,14 +75,27 @@ def test_every_mapper_recovers_the_synthetic_scene(tmp_path: Path, mapper: Mappe
     assert sorted(path.name for path in tmp_path.iterdir()) == ["database.db", "sparse"]
     assert [path.name for path in (tmp_path / "sparse").iterdir()] == ["0"]
     assert sorted(path.name for path in (tmp_path / "sparse/0").iterdir()) == MODEL_FILES
-    capfd.readouterr()
 
 
-def test_nothing_is_printed(tmp_path: Path, capfd) -> None:
+def test_nothing_is_printed_and_the_log_is_kept(tmp_path: Path, capfd) -> None:
     synthesize(tmp_path / "database.db")
+    for mapper in Mapper:
+        run(tmp_path / "database.db", tmp_path / "sparse", mapper=mapper)
+        assert capfd.readouterr() == ("", "")
     run(tmp_path / "database.db", tmp_path / "sparse", log_file=tmp_path / "log.txt")
     assert capfd.readouterr() == ("", "")
     assert "Registering image" in (tmp_path / "log.txt").read_text()
+
+
+def test_mapping_that_runs_out_of_time_keeps_what_there_is(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db")
+    (summary,) = run(
+        tmp_path / "database.db",
+        tmp_path / "sparse",
+        max_runtime_minutes=1 / 60,
+        on_progress=lambda num_registered: time.sleep(1.1 if num_registered == 4 else 0),
+    )
+    assert 4 <= summary.num_images < 10
 
 
 @pytest.mark.parametrize("sizes", [(4, 7), (7, 4)])

@@ -166,12 +166,15 @@ def _model_view(view: ModelView) -> str:
     try:
         drawn = f'<div class="model">{plotly_view(view)}</div>'
         note = f"{shown}. Drag to turn, scroll to zoom; point at a camera to read its photo's name."
-    except DependencyError as error:
+    except DependencyError:
         picture = pictures.draw_views(view.points, view.colours, view.centres)
         drawn = (
             f'<img class="wide" src="{pictures.png_uri(picture)}" alt="the model from above and the side">'
         )
-        note = f"{shown}, from above and from the side. {html.escape(str(error))}."
+        note = (
+            f"{shown}, from above and from the side. For a view that can be turned, "
+            "<code>pip install 'corrsfm[report]'</code> and make the report again."
+        )
     return f'{drawn}\n<p class="note">{note}</p>'
 
 

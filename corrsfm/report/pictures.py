@@ -173,7 +173,8 @@ def draw_views(
             return np.clip(np.round(flat), 0, side - 1).astype(np.int64)
 
         columns, rows = pixels(points).T
-        view[rows, columns] = colours[:, ::-1]
+        for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            view[np.minimum(rows + down, side - 1), np.minimum(columns + right, side - 1)] = colours[:, ::-1]
         for column, row in pixels(centres):
             cv2.circle(view, (int(column), int(row)), 4, _bgr(DROPPED_COLOUR), -1, cv2.LINE_AA)
         views.append(view)
