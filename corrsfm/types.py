@@ -115,7 +115,7 @@ class Features:
     orientations : (N,) float32
         Keypoint orientations in radians, in [-π, π), from the x axis towards the y axis.
     scores : (N,) float32
-        Detector responses; larger is stronger.
+        What the extractor ranks by (response × scale, or scale); larger is stronger.
     descriptors : (N, D) uint8
         Descriptors, quantised the way COLMAP does (unit vector × 512, clipped to 255).
     image_size : tuple of int
