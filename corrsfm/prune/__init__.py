@@ -25,7 +25,14 @@ from corrsfm.types import Correspondences, PruneResult
 if TYPE_CHECKING:
     from corrsfm.prune.learned import Pruner
 
-__all__ = ["Pruner", "PrunerProtocol", "build_pruner", "make_correspondences", "side_information"]
+__all__ = [
+    "Pruner",
+    "PrunerProtocol",
+    "build_pruner",
+    "checkpoint_sha256",
+    "make_correspondences",
+    "side_information",
+]
 
 
 class PrunerProtocol(Protocol):
@@ -95,6 +102,18 @@ def build_pruner(
         return RatioPruner(config.max_ratio)
     if config.method is PruneMethod.CORRADAPTOR:
         return _load_network_pruner(config, device)
+    if config.method is PruneMethod.CASCADE:
+        from corrsfm.prune.cascade import CascadePruner
+
+        network = _load_network_pruner(config, device) if checkpoint_sha256(config) else None
+        return CascadePruner(
+            network,
+            network_fingerprint=network.fingerprint if network else "",
+            max_ratio=config.max_ratio,
+            max_error_px=config.max_error_px,
+            seed=seed,
+            threads=threads,
+        )
     return EstimatorPruner(
         str(config.method),
         max_ratio=config.max_ratio,
@@ -102,6 +121,26 @@ def build_pruner(
         seed=seed,
         threads=threads,
     )
+
+
+def checkpoint_sha256(config: PruneConfig) -> str | None:
+    """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
+
+    The method cascade uses none as long as none is given and none is bundled.
+
+    Raises
+    ------
+    CheckpointError
+        If the method corradaptor is asked for and there is no checkpoint, or the file cannot be read.
+    """
+    if config.method not in (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE):
+        return None
+    from corrsfm.model import weights
+    from corrsfm.prune.learned import sha256_of
+
+    if config.method is PruneMethod.CASCADE and config.model is None and weights.DEFAULT_CHECKPOINT is None:
+        return None
+    return sha256_of(config.model)
 
 
 def _load_network_pruner(config: PruneConfig, device: str) -> Pruner:

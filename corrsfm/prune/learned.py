@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import OperatingPoint, Precision
-from corrsfm.errors import ConfigError, CorrsfmError
+from corrsfm.errors import CheckpointError, ConfigError, CorrsfmError
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.robust import normalised_residuals
@@ -30,6 +30,7 @@ __all__ = [
     "pack_batches",
     "select_candidates",
     "select_kept",
+    "sha256_of",
 ]
 
 logger = logging.getLogger(__name__)
@@ -250,7 +251,7 @@ class Pruner:
             If there is no usable checkpoint.
         """
         network = load_network(path)
-        return cls(network, checkpoint_sha256=_sha256_of(path), device=device, **options)
+        return cls(network, checkpoint_sha256=sha256_of(path), device=device, **options)
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
@@ -375,12 +376,25 @@ class Pruner:
                 return
 
 
-def _sha256_of(path: Path | None) -> str:
-    """Hash of a checkpoint that could be loaded."""
-    bundled = weights.REGISTRY.get(str(weights.DEFAULT_CHECKPOINT if path is None else path))
-    if bundled is not None:
-        return bundled.sha256
-    return hashlib.sha256(Path(str(path)).read_bytes()).hexdigest()
+def sha256_of(path: Path | None) -> str:
+    """Hash of a checkpoint: a file, the name of a bundled one, or None for the default one.
+
+    Raises
+    ------
+    CheckpointError
+        If the file cannot be read, or there is no default.
+    """
+    name = weights.DEFAULT_CHECKPOINT if path is None else str(path)
+    if name is None:
+        raise CheckpointError(
+            "no network checkpoint is bundled; give one with --model or choose --method loransac"
+        )
+    if name in weights.REGISTRY:
+        return weights.REGISTRY[name].sha256
+    try:
+        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
+    except OSError as error:
+        raise CheckpointError(f"{name}: the checkpoint cannot be read ({error.strerror})") from error
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:

@@ -38,6 +38,8 @@ MIN_NUM_INLIERS = 8
 
 _CONFIDENCE = 0.9999
 _MAX_MAGSAC_ITERATIONS = 10_000
+# Errors of right matches follow a χ distribution, whose 99 % quantile is 3.64 σ; OpenCV's threshold is σ.
+_MAGSAC_QUANTILE = 3.64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -170,7 +172,8 @@ def magsac(
 ) -> list[TwoViewEstimate]:
     """Two-view geometry by OpenCV's USAC framework with MAGSAC++ scoring and local optimisation.
 
-    Parameters and result as for `lo_ransac`.
+    Parameters and result as for `lo_ransac`. MAGSAC++ weighs errors up to ``max_error_px`` instead of
+    cutting there, but a match is an inlier by the same rule: a Sampson error below ``max_error_px``.
     """
     with ThreadPoolExecutor(threads if threads > 0 else None) as pool:
         return list(
@@ -182,27 +185,27 @@ def _magsac_pair(
     pair: Correspondences, candidates: NDArray[np.bool_], max_error_px: float, seed: int
 ) -> TwoViewEstimate:
     rows = _usable(pair, candidates)
-    inlier_mask = np.zeros(len(pair), bool)
-    nothing = TwoViewEstimate(model=None, inlier_mask=inlier_mask)
+    nothing = TwoViewEstimate(model=None, inlier_mask=np.zeros(len(pair), bool))
     if len(rows) < MIN_NUM_INLIERS:
         return nothing
     params = cv2.UsacParams()
     params.score = cv2.SCORE_METHOD_MAGSAC
     params.sampler = cv2.SAMPLING_UNIFORM
     params.loMethod = cv2.LOCAL_OPTIM_SIGMA
+    params.final_polisher = cv2.MAGSAC
     params.confidence = _CONFIDENCE
     params.maxIterations = _MAX_MAGSAC_ITERATIONS
     params.randomGeneratorState = seed
+    params.threshold = max_error_px / _MAGSAC_QUANTILE
     calibrated = pair.camera0.has_prior_focal_length and pair.camera1.has_prior_focal_length
     try:
         if calibrated:
             points = pair.normalised[rows].astype(np.float64)
-            params.threshold = max_error_px / _mean_focal_length_px(pair)
+            params.threshold /= _mean_focal_length_px(pair)
             eye = np.eye(3)
-            matrix, mask = cv2.findEssentialMat(points[:, :2], points[:, 2:], eye, eye, None, None, params)
+            matrix, _ = cv2.findEssentialMat(points[:, :2], points[:, 2:], eye, eye, None, None, params)
         else:
-            params.threshold = max_error_px
-            matrix, mask = cv2.findFundamentalMat(
+            matrix, _ = cv2.findFundamentalMat(
                 pair.points0[rows].astype(np.float64), pair.points1[rows].astype(np.float64), params
             )
     except cv2.error:
@@ -210,11 +213,11 @@ def _magsac_pair(
         return nothing
     if matrix is None or np.shape(matrix) != (3, 3) or not np.isfinite(matrix).all() or not np.any(matrix):
         return nothing
-    inlier_mask[rows[np.asarray(mask).ravel().astype(bool)]] = True
-    if np.count_nonzero(inlier_mask) < MIN_NUM_INLIERS:
-        return TwoViewEstimate(model=None, inlier_mask=np.zeros(len(pair), bool))
     kind: Literal["essential", "fundamental"] = "essential" if calibrated else "fundamental"
     model = TwoViewModel(kind=kind, matrix=np.asarray(matrix, np.float64))
+    inlier_mask = candidates & (sampson_errors_px(model, pair) < max_error_px)
+    if np.count_nonzero(inlier_mask) < MIN_NUM_INLIERS:
+        return nothing
     return TwoViewEstimate(model=model, inlier_mask=inlier_mask)
 
 
@@ -293,35 +296,38 @@ def msac_scores(errors_px: NDArray[np.float64], max_error_px: float) -> NDArray[
 
 
 def best_model(
-    models: Sequence[TwoViewModel | None],
+    models: Sequence[TwoViewModel],
     pair: Correspondences,
     judges: NDArray[np.bool_],
+    *,
     max_error_px: float,
+    margin: float = 0.0,
 ) -> int | None:
     """The model that explains most of a common set of matches.
 
-    Every hypothesis was estimated from another subset, on which it looks best; only a common, unbiased set
-    makes them comparable. The mutual matches are that set: large, and chosen by no hypothesis.
+    Every hypothesis was estimated from another subset, on which it looks best; only a common set makes them
+    comparable.
 
     Parameters
     ----------
-    models : sequence of TwoViewModel or None
+    models : sequence of TwoViewModel
+        The most trusted first.
     pair : Correspondences
     judges : (M,) bool
         The matches that vote.
     max_error_px : float
         Truncation of the MSAC score, pixels.
+    margin : float
+        How much more of the score, as a share, a model needs to replace one that is trusted more.
 
     Returns
     -------
     int or None
-        Index of the first best model; None if all are None.
+        Index of the winner; None without models.
     """
-    best, best_score = None, -1.0
+    best, best_score = None, 0.0
     for index, model in enumerate(models):
-        if model is None:
-            continue
         score = float(msac_scores(sampson_errors_px(model, pair)[judges], max_error_px).sum(dtype=np.float64))
-        if score > best_score:
+        if best is None or score > (1.0 + margin) * best_score:
             best, best_score = index, score
     return best
