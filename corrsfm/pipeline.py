@@ -66,11 +66,13 @@ def index_photos(
     InputError
         If there are fewer than two photos, or the folder, list, masks or camera options cannot be used.
     """
-    from corrsfm.images import duplicate_images, index_images
+    from corrsfm.images import duplicate_images, index_images, name_remarks
 
     started = time.monotonic()
     records, cameras = index_images(images_dir, config)
     check_hloc_keys(record.name for record in records)
+    for remark in name_remarks([record.name for record in records]):
+        logger.warning("%s", remark)
     for names in duplicate_images(records):
         logger.warning("photos with the same content: %s", ", ".join(names))
     index = Index(records=tuple(records), cameras=tuple(cameras))

@@ -201,14 +201,26 @@ def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _ranked(models: Iterable[pycolmap.Reconstruction], min_model_size: int) -> list[pycolmap.Reconstruction]:
-    """The models that count, the largest first; the first one counts whatever its size."""
+    """The models that count, the largest first; the first one counts whatever its size.
+
+    A model whose photos all lie in one larger model is a failed start of the same place and not kept.
+    """
 
     def rank(model: pycolmap.Reconstruction) -> tuple[int, int, str]:
         return -model.num_reg_images(), -model.num_points3D(), _first_name(model)
 
     ranked = sorted((model for model in models if model.num_reg_images() > 1), key=rank)
-    # The mappers do not always obey their option of this name.
-    return ranked[:1] + [model for model in ranked[1:] if model.num_reg_images() >= min_model_size]
+    kept = ranked[:1]
+    for model in ranked[1:]:
+        # The mappers do not always obey their option of this name.
+        large_enough = model.num_reg_images() >= min_model_size
+        if large_enough and not any(_names(model) <= _names(larger) for larger in kept):
+            kept.append(model)
+    return kept
+
+
+def _names(model: pycolmap.Reconstruction) -> set[str]:
+    return {image.name for image in model.images.values() if image.has_pose}
 
 
 def _first_name(model: pycolmap.Reconstruction) -> str:

@@ -15,7 +15,7 @@ import pytest
 from corrsfm.colmap import observation_errors, read_models, summarise_model
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError, WorkspaceError
-from corrsfm.reconstruction import reconstruct
+from corrsfm.reconstruction import _ranked, reconstruct
 
 MODEL_FILES = ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
 
@@ -160,7 +160,7 @@ def test_killed_mapping_leaves_no_models_and_the_next_run_succeeds(tmp_path: Pat
 import os
 from pathlib import Path
 from corrsfm.config import ReconstructionConfig
-from corrsfm.reconstruction import reconstruct
+from corrsfm.reconstruction import _ranked, reconstruct
 folder = Path({str(tmp_path)!r})
 reconstruct(folder / "database.db", None, folder / "sparse", config=ReconstructionConfig(),
             on_progress=lambda num: os._exit(9) if num == 6 else None)
@@ -177,7 +177,7 @@ def test_interrupt_stops_a_mapper_that_does_not_look_for_it(tmp_path: Path) -> N
 import sys
 from pathlib import Path
 from corrsfm.config import Mapper, ReconstructionConfig
-from corrsfm.reconstruction import reconstruct
+from corrsfm.reconstruction import _ranked, reconstruct
 folder = Path({str(tmp_path)!r})
 print("ready", flush=True)
 try:
@@ -318,3 +318,12 @@ def test_observation_errors_are_distances_in_pixels(tmp_path: Path) -> None:
     summary = summarise_model(model)
     assert summary.mean_error_px == pytest.approx(10 / 120, abs=1e-6)
     assert summary.median_error_px == pytest.approx(0, abs=1e-6)
+
+
+def test_a_model_inside_a_larger_one_is_not_kept(tmp_path: Path) -> None:
+    whole = synthesize(tmp_path / "database.db", num_images=6)
+    part = pycolmap.Reconstruction(whole)
+    for frame_id in list(part.reg_frame_ids())[:2]:
+        part.deregister_frame(frame_id)
+    assert part.num_reg_images() == 4
+    assert [model.num_reg_images() for model in _ranked([part, whole], 3)] == [6]
