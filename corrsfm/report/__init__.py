@@ -1,4 +1,18 @@
-"""Models → statistics as JSON and text, and an HTML page with pictures."""
+"""Models → statistics as JSON and text, and an HTML page with pictures.
+
+::
+
+    report/
+    ├── scene.py        the statistics, and why photos are missing
+    ├── table.py        the statistics as text
+    ├── page.py         the HTML page, `write_html`
+    ├── style.py        its look
+    ├── charts.py       its drawings: histograms, bars, axes
+    ├── pictures.py     its pictures: matches on photos, the view graph
+    └── model_view.py   its view of the model, by plotly or still
+
+Importing this package loads neither OpenCV nor pycolmap; `corrsfm.report.page` does.
+"""
 
 from corrsfm.report.scene import MissingImage, MissingReason, SceneReport, make_report
 from corrsfm.report.table import format_table

@@ -91,7 +91,8 @@ def write_html(
 
 
 def _subtitle(report: SceneReport) -> str:
-    method = report.configuration.get("prune", {}).get("method")
+    sections = [section for section in report.configuration.values() if isinstance(section, dict)]
+    method = next((section["method"] for section in sections if "method" in section), None)
     made_by = f"corrsfm {report.versions['corrsfm']}" if "corrsfm" in report.versions else "corrsfm"
     return html.escape(f"Reconstruction by {made_by}" + (f", matches pruned by {method}" if method else ""))
 
