@@ -6,6 +6,7 @@ treatment of distortion. Thresholds are pixels of the original photos unless a d
 
 from __future__ import annotations
 
+import importlib.metadata
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -18,13 +19,23 @@ from corrsfm.errors import ConfigError, DependencyError
 from corrsfm.geometry import symmetric_epipolar_distance_sq
 from corrsfm.types import Camera, Correspondences, PruneResult
 
-__all__ = ["ESTIMATORS", "PoseEstimate", "PoseEstimator", "parse_estimator", "weighted_eight_point"]
+__all__ = [
+    "ESTIMATORS",
+    "PoseEstimate",
+    "PoseEstimator",
+    "estimator_fingerprint",
+    "parse_estimator",
+    "weighted_eight_point",
+]
 
 # The paper's cheirality mask and RANSAC settings, normalised units.
 _CHEIRALITY_RESIDUAL = 3e-5
 _LITERATURE_THRESHOLD = 1e-3
 _CONFIDENCE = 0.99999
 _MAX_ITERATIONS = 10000
+# PoseLib's defaults: fewer would handicap it on unfiltered matches.
+_POSELIB_ITERATIONS = 100000
+_POSELIB_CONFIDENCE = 0.9999
 # OpenCV's default. Its old RANSAC solves every sample on one core for minutes if allowed more.
 _LITERATURE_ITERATIONS = 1000
 
@@ -239,8 +250,8 @@ def _poselib(
         {
             "max_epipolar_error": 1.0 if threshold_px is None else threshold_px,
             "seed": seed,
-            "success_prob": _CONFIDENCE,
-            "max_iterations": _MAX_ITERATIONS,
+            "success_prob": _POSELIB_CONFIDENCE,
+            "max_iterations": _POSELIB_ITERATIONS,
         },
         {},
     )
@@ -317,6 +328,20 @@ ESTIMATORS: dict[str, Callable[..., PoseEstimate | None]] = {
     "w8pt": _eight_point,
 }
 """Estimators by name. ``ransac`` is the literature's: OpenCV's old one at 1e-3 in normalised units."""
+
+_PACKAGES = {"colmap": "pycolmap", "poselib": "poselib", "w8pt": "numpy"}
+
+
+def estimator_fingerprint(text: str) -> str:
+    """Changes whenever an estimator's results may: its budget, and the version of its library."""
+    package = _PACKAGES.get(text.partition(":")[0], "opencv-python-headless")
+    try:
+        version = importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        version = "absent"
+    budget = (_CONFIDENCE, _MAX_ITERATIONS, _LITERATURE_ITERATIONS, _POSELIB_CONFIDENCE, _POSELIB_ITERATIONS)
+    return f"{text}, {package} {version}, {budget}"
+
 
 _DEFAULT_PX = {"ransac": None, "w8pt": None}
 

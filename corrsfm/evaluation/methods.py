@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from corrsfm.errors import ConfigError
-from corrsfm.evaluation.estimators import PoseEstimate, PoseEstimator, parse_estimator
+from corrsfm.evaluation.estimators import PoseEstimate, PoseEstimator, estimator_fingerprint, parse_estimator
 from corrsfm.evaluation.filters import PairFilter, parse_filter
 from corrsfm.oanet import OANetPair
 from corrsfm.types import PruneResult
@@ -70,7 +70,8 @@ class TwoViewMethod:
     @property
     def fingerprint(self) -> str:
         """Changes whenever results may."""
-        return f"{self.name} | {self.filter.fingerprint}"
+        estimator = estimator_fingerprint(self.name.rpartition("/")[2])
+        return f"{self.filter.fingerprint} | {estimator}"
 
     def __call__(self, pairs: Sequence[OANetPair], *, seed: int = 0) -> list[MethodOutput]:
         """Filter all pairs together, then estimate each pose.
