@@ -10,6 +10,7 @@ import click
 
 from corrsfm import __version__
 from corrsfm.cli.batch import batch
+from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.errors import CorrsfmError
@@ -69,5 +70,5 @@ def main(quiet: bool) -> None:
         os.environ["TQDM_DISABLE"] = "1"
 
 
-for _command in (run, extract, pairs, match, prune, reconstruct, report, batch, evaluate):
+for _command in (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate):
     main.add_command(_command)
