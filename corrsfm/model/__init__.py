@@ -1,4 +1,4 @@
-"""The network: tensors in, tensors out; see `network` for what it computes and `weights` for its checkpoints."""
+"""The network, tensors in and out: `network` says what it computes, `weights` reads its checkpoints."""
 
 from corrsfm.model.network import CorrAdaptor, NetworkConfig, PruningOutput
 from corrsfm.model.weights import load_network, read_provenance, save_network

@@ -1,6 +1,7 @@
-"""CorrAdaptor: adaptive local context learning for correspondence pruning (Zhu et al., ECAI 2024), in PyTorch.
+"""CorrAdaptor: adaptive local context learning for correspondence pruning (Zhu et al., ECAI 2024).
 
-The file reads from the bottom of the network to its top, and each part names the section of the paper it comes from:
+The file reads from the bottom of the network to its top, and each part names the section of the paper it
+comes from:
 
     rows of a batch            means, maxima and normalisation that know about padding
     explicit branch (3.3)      KNN graph, graph attention, annular convolution
@@ -9,12 +10,13 @@ The file reads from the bottom of the network to its top, and each part names th
     two-view geometry (3.1)    weighted eight-point algorithm, full-size verification
     network (3.2)              fusion rounds, pruning blocks, `NetworkConfig`, `CorrAdaptor`
 
-Shapes: B pairs, N correspondences, C channels, k neighbours, M clusters, H heads of D = C / H channels. Channels are
-always the last axis, so that every 1x1 convolution of the published code is one matrix product without a copy.
+Shapes: B pairs, N correspondences, C channels, k neighbours, M clusters, H heads of D = C / H channels.
+Channels are always the last axis, so that every 1x1 convolution of the published code is one matrix product
+without a copy.
 
-Pairs of different sizes share a batch through ``mask (B,N) bool``, True on correspondences and False on padding;
-``None`` means that all rows are correspondences. Every operation that mixes rows takes the mask, so a pair's result
-does not depend on what it is batched with.
+Pairs of different sizes share a batch through ``mask (B,N) bool``, True on correspondences and False on
+padding; ``None`` means that all rows are correspondences. Every operation that mixes rows takes the mask, so
+a pair's result does not depend on what it is batched with.
 """
 
 from __future__ import annotations
@@ -38,14 +40,15 @@ __all__ = [
     "weighted_eight_point",
 ]
 
-# A correspondence farther out than this (a viewing ray within 0.006 degrees of the image plane) is treated as padding.
+# A correspondence farther out than this (a viewing ray within 0.006 degrees of the image plane) is treated
+# as padding.
 LARGEST_COORDINATE = 1e4
 
 FLOW_EPSILON = 1e-6
 
 
 def full_precision(x: Tensor) -> torch.autocast:
-    """Context in which autocast is off: coordinates, distances and rankings do not survive 8 bits of mantissa."""
+    """Context without autocast, for coordinates, distances and rankings: they need more than 8 bits."""
     return torch.autocast(x.device.type, enabled=False)
 
 
@@ -95,7 +98,7 @@ def take_rows(x: Tensor, index: Tensor) -> Tensor:
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Holds scale, shift and running statistics; `normalise` and `linear_norm` apply them to channels-last rows."""
+    """Scale, shift and running statistics; `normalise` and `linear_norm` apply them to the last axis."""
 
     running_mean: Tensor
     running_var: Tensor
@@ -103,45 +106,29 @@ class BatchNorm(nn.BatchNorm1d):
     momentum: float
 
 
-class Centred(NamedTuple):
-    """A feature map minus its mean over the positions of each pair, and its variance there."""
+def normalise(x: Tensor, norm: BatchNorm, eps: float, mask: Tensor | None) -> Tensor:
+    """Instance normalisation without affine, then batch normalisation, as one scale and one shift.
 
-    values: Tensor  # like the input
-    variance: Tensor  # (B,1,...,C), biased, at least float32
-
-
-def centre(x: Tensor, mask: Tensor | None) -> Centred:
-    """First half of instance normalisation, shared by all normalisations of the same features.
+    Instance-normalised features have mean 0 and variance v / (v + eps) in every pair, so the batch statistics
+    follow from the instance statistics without looking at the features again, in training too.
 
     Parameters
     ----------
     x : Tensor, shape (B,N,C) or (B,N,k,C)
+    norm : BatchNorm
+    eps : float
+        Of the instance normalisation.
     mask : Tensor, shape (B,N) bool, optional
     """
-    wide = torch.promote_types(x.dtype, torch.float32)
-    positions = tuple(range(1, x.ndim - 1))
-    if mask is None:
-        # Sums rather than means: in bfloat16 a mean copies its input to float32 first.
-        count: Tensor | int = math.prod(x.shape[1:-1])
-        values = x - x.sum(positions, keepdim=True) / count
-        return Centred(values, values.square().sum(positions, keepdim=True).to(wide) / count)
-    with full_precision(x):
-        count = mask.sum(1).view(-1, *[1] * (x.ndim - 1)) * math.prod(x.shape[2:-1])
-        mean = row_sum(x.to(wide), mask).sum(positions, keepdim=True) / count
-        values = x - mean.to(x.dtype)
-        variance = row_sum(values.to(wide).square(), mask).sum(positions, keepdim=True) / count
-    return Centred(values, variance)
-
-
-def normalise(centred: Centred, norm: BatchNorm, eps: float, mask: Tensor | None) -> Tensor:
-    """Instance normalisation without affine, then batch normalisation, as one scale and one shift.
-
-    Instance-normalised features have mean 0 and variance v / (v + eps) in every pair, so the batch statistics follow
-    from the instance statistics without looking at the features again, in training too.
-    """
-    values, variance = centred
+    if not norm.training and mask is None and x.shape[0] == 1:
+        # With one pair, instance normalisation is the batch normalisation of that pair: one native kernel.
+        gain = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+        shift = norm.bias - norm.running_mean * gain
+        rows, *_ = torch.native_batch_norm(x.flatten(0, -2), gain, shift, None, None, True, 0.0, eps)
+        return rows.view(x.shape)
+    values, variance = centre(x, mask)
     if norm.training:
-        batch_mean, batch_variance = _follow_batch(centred, norm, eps, mask)
+        batch_mean, batch_variance = _follow_batch(values, variance, norm, eps, mask)
     else:
         batch_mean, batch_variance = norm.running_mean, norm.running_var
     gain = norm.weight * torch.rsqrt(batch_variance + norm.eps)
@@ -150,11 +137,26 @@ def normalise(centred: Centred, norm: BatchNorm, eps: float, mask: Tensor | None
     return torch.addcmul(shift.to(values.dtype), values, scale.to(values.dtype))
 
 
+def centre(x: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Features minus their mean over the positions of each pair, and their variance (B,1,...,C) there."""
+    wide = torch.promote_types(x.dtype, torch.float32)
+    positions = tuple(range(1, x.ndim - 1))
+    if mask is None:
+        # Sums rather than means: in bfloat16 a mean copies its input to float32 first.
+        num_positions = math.prod(x.shape[1:-1])
+        values = x - x.sum(positions, keepdim=True) / num_positions
+        return values, values.square().sum(positions, keepdim=True).to(wide) / num_positions
+    with full_precision(x):
+        count = mask.sum(1).view(-1, *[1] * (x.ndim - 1)) * math.prod(x.shape[2:-1])
+        mean = row_sum(x.to(wide), mask).sum(positions, keepdim=True) / count
+        values = x - mean.to(x.dtype)
+        return values, row_sum(values.to(wide).square(), mask).sum(positions, keepdim=True) / count
+
+
 def _follow_batch(
-    centred: Centred, norm: BatchNorm, eps: float, mask: Tensor | None
+    values: Tensor, variance: Tensor, norm: BatchNorm, eps: float, mask: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Mean and variance of instance-normalised features over the batch; updates the running statistics."""
-    values, variance = centred
     normalised = (variance / (variance + eps)).reshape(-1, variance.shape[-1])  # (B,C)
     if mask is None:
         batch_variance = normalised.mean(0)
@@ -194,7 +196,7 @@ def linear_norm(x: Tensor, linear: nn.Linear, norm: BatchNorm, mask: Tensor | No
 
 
 def nearest_neighbors(features: Tensor, k: int, mask: Tensor | None) -> Tensor:
-    """The k nearest correspondences of each in feature space, itself included, nearest first: (B,N,C) to (B,N,k).
+    """The k nearest correspondences of each in feature space, itself first: (B,N,C) to (B,N,k).
 
     A pair with fewer than k correspondences repeats each correspondence itself in the missing places.
     """
@@ -206,7 +208,10 @@ def nearest_neighbors(features: Tensor, k: int, mask: Tensor | None) -> Tensor:
             squared_norm = squared_norm.masked_fill(~mask, math.inf)
         # |f_j|^2 - 2 f_i.f_j orders the neighbours of i as the distance does: |f_i|^2 is the same for all j.
         ones = torch.ones_like(squared_norm)[..., None]
-        left, right = torch.cat([features, ones], dim=-1), torch.cat([-2 * features, squared_norm[..., None]], -1)
+        left, right = (
+            torch.cat([features, ones], dim=-1),
+            torch.cat([-2 * features, squared_norm[..., None]], -1),
+        )
         ranking = left @ right.mT  # (B,N,N)
         values, index = ranking.topk(k, dim=-1, largest=False, sorted=True)
         if mask is not None:
@@ -241,9 +246,9 @@ class PointContext(nn.Module):
         self.linear2 = nn.Linear(channels, channels)
 
     def forward(self, graph: Tensor, mask: Tensor | None) -> Tensor:
-        x = F.gelu(normalise(centre(graph, mask), self.norm1, 1e-3, mask))
+        x = F.gelu(normalise(graph, self.norm1, 1e-3, mask))
         x = F.linear(x, self.linear1.weight)  # its bias would vanish in the normalisation that follows
-        return self.linear2(F.gelu(normalise(centre(x, mask), self.norm2, 1e-3, mask)))
+        return self.linear2(F.gelu(normalise(x, self.norm2, 1e-3, mask)))
 
 
 class ExplicitBranch(nn.Module):
@@ -297,7 +302,7 @@ class ExplicitBranch(nn.Module):
         own = F.linear(features, centre_weight + offset_weight, self.embed.bias)
         other = F.linear(features, offset_weight)
         edges = own[:, :, None] - take_rows(other, index)
-        return normalise(centre(edges, mask), self.embed_norm, 1e-5, mask)
+        return normalise(edges, self.embed_norm, 1e-5, mask)
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -318,10 +323,10 @@ class OrderAwareFilter(nn.Module):
         self.linear2 = nn.Linear(channels, channels)
 
     def forward(self, clusters: Tensor) -> Tensor:
-        x = self.linear1(F.relu(normalise(centre(clusters, None), self.norm1, 1e-3, None)))  # (B,M,C)
-        # The middle layer mixes clusters: its matrix multiplies from the left, which saves the transpositions.
+        x = self.linear1(F.relu(normalise(clusters, self.norm1, 1e-3, None)))  # (B,M,C)
+        # The middle layer mixes clusters: its matrix multiplies from the left, which saves transpositions.
         x = x + self.cluster_linear.weight @ F.relu(self.cluster_norm(x)) + self.cluster_linear.bias[:, None]
-        return self.linear2(F.relu(normalise(centre(x, None), self.norm2, 1e-3, None))) + clusters
+        return self.linear2(F.relu(normalise(x, self.norm2, 1e-3, None))) + clusters
 
 
 class ImplicitBranch(nn.Module):
@@ -336,12 +341,11 @@ class ImplicitBranch(nn.Module):
         self.unpool = nn.Linear(channels, num_clusters)
 
     def forward(self, features: Tensor, mask: Tensor | None) -> Tensor:
-        centred = centre(features, mask)
-        assignment = self.pool(F.relu(normalise(centred, self.pool_norm, 1e-3, mask)))  # (B,N,M)
+        assignment = self.pool(F.relu(normalise(features, self.pool_norm, 1e-3, mask)))  # (B,N,M)
         clusters = row_softmax(assignment, mask).mT @ features  # (B,M,C)
         for order_aware_filter in self.filters:
             clusters = order_aware_filter(clusters)
-        assignment = self.unpool(F.relu(normalise(centred, self.unpool_norm, 1e-3, mask)))
+        assignment = self.unpool(F.relu(normalise(features, self.unpool_norm, 1e-3, mask)))
         return assignment.softmax(2) @ clusters  # (B,N,C)
 
 
@@ -398,9 +402,9 @@ class Attention(nn.Module):
         Parameters
         ----------
         tokens : Tensor, shape (R B, N, C)
-            R branches of B pairs. Layer-normalised without affine if ``query_norm`` is given, else used as they are.
+            R branches of B pairs, layer-normalised without affine if ``query_norm`` is given.
         context : Tensor, shape (R B, N, C) or (B, N, C)
-            Layer-normalised without affine; with B items it is shared by the branches and its keys are computed once.
+            Layer-normalised without affine; with B items the branches share it and its keys.
         query_norm, context_norm : LayerNorm
             Whose affine parts are still to be applied; they are folded into the projections.
         mask : Tensor, shape (R B, N) bool, optional
@@ -426,13 +430,19 @@ class Attention(nn.Module):
         return self.output(out.transpose(1, 2).flatten(2))
 
     def _flow(
-        self, q: Tensor, k: Tensor, context: Tensor, value_weight: Tensor, value_bias: Tensor, mask: Tensor | None
+        self,
+        q: Tensor,
+        k: Tensor,
+        context: Tensor,
+        value_weight: Tensor,
+        value_bias: Tensor,
+        mask: Tensor | None,
     ) -> Tensor:
         """Flow attention: linear in N, with competition among sources and allocation to sinks.
 
-        With S = K diag(competition), the paper's Q (S^T V) W_o is computed as Q ((S^T context) W_v W_o): values,
-        which nothing else needs, are never formed on N rows, and the two products after the sum over tokens
-        become one.
+        With S = K diag(competition), the paper's Q (S^T V) W_o is computed as Q ((S^T context) W_v W_o):
+        values, which nothing else needs, are never formed on N rows, and the two products after the sum over
+        tokens become one.
         """
         heads = self.num_heads
         if mask is not None:
@@ -453,7 +463,7 @@ class Attention(nn.Module):
         flow = summed @ value_weight.unflatten(0, (heads, -1)).mT + mass * value_bias.view(heads, 1, -1)
         flow = flow @ self.output.weight.mT.unflatten(0, (heads, -1))  # (B,H,D,D) to (B,H,D,C)
         gated = self._scale_heads(q, incoming * allocation)
-        return gated @ flow.flatten(1, 2).to(gated.dtype) + self.output.bias
+        return gated @ flow.flatten(1, 2).to(gated.dtype) + self.output.bias.to(gated.dtype)
 
     def _dot(self, x: Tensor, y: Tensor) -> Tensor:
         """(x + eps) . (y + eps) + eps in each head: (B,N,C), (B,C) to (B,H,N)."""
@@ -503,7 +513,8 @@ class MotionInjectionLayer(nn.Module):
         if motion is not None:
             x = x + self.motion_attention(x, motion, None, self.motion_norm, mask)
         x = self.mlp_norm(x)
-        return x + self.layer_scale * self.contract(F.gelu(self.expand(x)))
+        x_mlp = self.contract(F.gelu(self.expand(x)))
+        return torch.addcmul(x, self.layer_scale.to(x.dtype), x_mlp.to(x.dtype))
 
 
 # ----------------------------------------------------------------------------------------------------------
@@ -514,8 +525,8 @@ class MotionInjectionLayer(nn.Module):
 class SmallestEigenvector(torch.autograd.Function):
     """Unit eigenvector of the smallest eigenvalue of symmetric matrices, (...,n,n) to (...,n).
 
-    The gradient divides by the gaps to the other eigenvalues. Where a gap vanishes the eigenvector is not defined and
-    that direction gets no gradient instead of an infinite one.
+    The gradient divides by the gaps to the other eigenvalues. Where a gap vanishes the eigenvector is not
+    defined, and that direction gets no gradient instead of an infinite one.
     """
 
     @staticmethod
@@ -550,7 +561,8 @@ def weighted_eight_point(correspondences: Tensor, weights: Tensor, *, fundamenta
     Returns
     -------
     Tensor, shape (B,3,3)
-        Of unit norm, sign undetermined. Always finite: without usable correspondences it is an arbitrary unit matrix.
+        Of unit norm, sign undetermined. Always finite: without usable correspondences it is an arbitrary
+        unit matrix.
     """
     dtype = correspondences.dtype
     with full_precision(correspondences):
@@ -570,7 +582,7 @@ def weighted_eight_point(correspondences: Tensor, weights: Tensor, *, fundamenta
 
 
 def symmetric_epipolar_squared(correspondences: Tensor, matrix: Tensor) -> Tensor:
-    """Squared symmetric epipolar distance, in the unit of the coordinates squared: (B,N,4), (B,3,3) to (B,N)."""
+    """Squared symmetric epipolar distance in squared coordinate units: (B,N,4), (B,3,3) to (B,N)."""
     with full_precision(correspondences):
         ones = torch.ones_like(correspondences[..., :1])
         point0 = torch.cat([correspondences[..., :2], ones], dim=-1)
@@ -641,9 +653,9 @@ class PruningBlock(nn.Module):
         )
 
     def forward(self, inputs: Tensor, mask: Tensor | None) -> tuple[Tensor, list[Tensor]]:
-        """Inputs (B,N,4 + more), coordinates first, to features (B,N,C) and the logits (B,N) of each round."""
+        """Inputs (B,N,4 + more), coordinates first, to features (B,N,C) and logits (B,N) of each round."""
         with full_precision(inputs):
-            features = F.relu(normalise(centre(self.stem(inputs), mask), self.stem_norm, 1e-5, mask))
+            features = F.relu(normalise(self.stem(inputs), self.stem_norm, 1e-5, mask))
             motion = None
             if self.motion is not None:
                 embedded = self.motion(inputs[..., :4], mask)
@@ -656,7 +668,7 @@ class PruningBlock(nn.Module):
 
 
 class WeightHead(nn.Module):
-    """Residual unit, then for each remaining correspondence a logit and the logarithm of its eight-point weight."""
+    """Residual unit, then a logit and the logarithm of an eight-point weight for each correspondence."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -665,16 +677,16 @@ class WeightHead(nn.Module):
         self.linear2 = nn.Linear(channels, channels)
         self.norm2 = BatchNorm(channels)
         self.output = nn.Linear(channels, 2)
-        # The published unit has this projection beside its shortcut and adds the input instead. It is here because
-        # the published parameter counts include it; frozen, because no gradient ever reaches it.
+        # The published unit owns this projection and adds the unprojected input. It is here because the
+        # published parameter counts include it, and frozen because no gradient ever reaches it.
         self.shortcut = nn.Linear(channels, channels).requires_grad_(False)
 
     def forward(self, features: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:
         """Features (B,N,C) to logits (B,N) and weights (B,N) that sum to almost one."""
         with full_precision(features):
             features = features.to(self.output.weight.dtype)
-            x = F.gelu(normalise(centre(self.linear1(features), mask), self.norm1, 1e-5, mask))
-            x = normalise(centre(self.linear2(x), mask), self.norm2, 1e-5, mask)
+            x = F.gelu(normalise(self.linear1(features), self.norm1, 1e-5, mask))
+            x = normalise(self.linear2(x), self.norm2, 1e-5, mask)
             logit, log_weight = self.output(F.gelu(x + features)).unbind(-1)
             weight = log_weight.clamp(max=60).exp() * logit.sigmoid()
             if mask is not None:
@@ -685,9 +697,10 @@ class WeightHead(nn.Module):
 class PruningOutput(NamedTuple):
     """What the network says about a batch of pairs.
 
-    With R fusion rounds there are 2 R + 1 sets of logits: R on all correspondences, R on those kept by the first
-    pruning block, one on those kept by the second; five in the published configuration. Rows that hold padding have
-    the logit minus infinity and a residual of infinity; a pair of n correspondences keeps max(floor(n/2), 1) at a step.
+    With R fusion rounds there are 2 R + 1 sets of logits: R on all correspondences, R on those kept by the
+    first pruning block, one on those kept by the second; five in the published configuration. Padding has the
+    logit minus infinity and an infinite residual. A pair of n correspondences keeps max(floor(n/2), 1) at a
+    step.
     """
 
     logits: tuple[Tensor, ...]  # (B,N), ..., (B,N'), ..., (B,N'')
@@ -767,8 +780,9 @@ class CorrAdaptor(nn.Module):
 
     `NetworkConfig` documents the arguments and holds their defaults; `from_config` builds a network from one.
 
-    In inference its fastest form is ``network.eval()`` under `torch.inference_mode`; under `torch.autocast` to bfloat16
-    whatever must not be rounded (coordinates, neighbour search, logits, geometry) stays in float32.
+    In inference its fastest form is ``network.eval()`` under `torch.inference_mode`, on one CPU pair by pair.
+    Under `torch.autocast` to bfloat16 whatever must not be rounded (coordinates, neighbour search, logits,
+    geometry) stays in float32.
     """
 
     config: NetworkConfig | None = None
@@ -804,7 +818,7 @@ class CorrAdaptor(nn.Module):
 
     @classmethod
     def from_config(cls, config: NetworkConfig) -> Self:
-        """Build the network that a configuration describes, with fresh weights; it remembers the configuration."""
+        """Build the network that a configuration describes, with fresh weights."""
         network = cls(**{field.name: getattr(config, field.name) for field in dataclasses.fields(config)})
         network.config = config
         return network
@@ -863,7 +877,7 @@ class CorrAdaptor(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Finite inputs with enough rows for the neighbour search, and the mask of what is real among them.
 
-        A pair always has at least one row that counts, at worst a zero, so that no mean is taken over nothing.
+        A pair always has at least one row that counts, at worst a zero: no mean is taken over nothing.
         """
         batch, num_rows, _ = correspondences.shape
         side = correspondences.new_zeros(batch, num_rows, 0) if side_information is None else side_information

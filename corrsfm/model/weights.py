@@ -7,8 +7,9 @@ A checkpoint is one file that `torch.load` reads with ``weights_only=True``::
      "state_dict": {...},     parameters and running statistics, in float32 or half precision
      "provenance": {...}}     plain values: data, licence, steps, seed, scores, ...
 
-The published format (the authors' training code: a ``state_dict`` key, names perhaps behind ``module.``) loads as well.
-Bundled checkpoints lie beside this file and are listed in `REGISTRY`; their hash is checked at every loading.
+The published format (the authors' training code: a ``state_dict`` key, names perhaps behind ``module.``)
+loads as well. Bundled checkpoints lie beside this file and are listed in `REGISTRY`; their hash is checked at
+every loading.
 """
 
 from __future__ import annotations
@@ -84,8 +85,8 @@ def load_network(path: Path | str | None = None, *, map_location: str | torch.de
     Raises
     ------
     CheckpointError
-        If the file is missing, damaged, of another format or of another network; missing and unexpected keys are
-        listed. If nothing is bundled, or a bundled file is not the one that was released.
+        If the file is missing, damaged, of another format or of another network; missing and unexpected keys
+        are listed. If nothing is bundled, or a bundled file is not the one that was released.
     """
     bundled = _find_bundled(path)
     file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
@@ -182,7 +183,8 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
         found = hashlib.sha256(file.read_bytes()).hexdigest()
         if found != expected_sha256:
             raise CheckpointError(
-                f"{file}: SHA-256 is {found}, expected {expected_sha256}; the file is damaged: reinstall corrsfm"
+                f"{file}: SHA-256 is {found}, expected {expected_sha256}; "
+                "the file is damaged: reinstall corrsfm"
             )
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
@@ -235,7 +237,8 @@ def _fill(network: CorrAdaptor, state: Mapping[str, Any], file: Path) -> None:
 # Tensors of the published checkpoint that never reach its output.
 UNUSED = re.compile(r"\.(m_proj|fusion[12]|embed_1)\.")
 
-# Published name to ours, applied in this order. Sequential containers are numbered there; here layers have names.
+# Published name to ours, applied in this order. Sequential containers are numbered there; here layers have
+# names.
 RENAMING = [
     (r"^ds_1\.embed_2\.right\.0\.", "head.shortcut."),
     (r"^ds_1\.embed_2\.left\.0\.", "head.linear1."),
@@ -311,7 +314,8 @@ def from_published(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
         for pattern, replacement in RENAMING:
             name = re.sub(pattern, replacement, name)
         if isinstance(value, Tensor) and value.ndim == 4:
-            # Convolution (out, in, 1, width) to linear layer (out, width * in): our rows hold one neighbour after another.
+            # Convolution (out, in, 1, width) to linear layer (out, width * in): our rows hold one neighbour
+            # after another.
             value = value.squeeze(2).transpose(1, 2).flatten(1)
         result[name] = value
     return result
