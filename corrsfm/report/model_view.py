@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 
 import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
@@ -141,7 +140,7 @@ def plotly_view(view: ModelView) -> str:
         If plotly is not installed.
     """
     try:
-        graph_objects = importlib.import_module("plotly.graph_objects")
+        import plotly.graph_objects as graph_objects
     except ImportError as error:
         raise DependencyError("plotly", "the interactive 3-D view", "report") from error
     points = view.points.astype(np.float32)
