@@ -5,7 +5,6 @@ import sys
 import time
 from pathlib import Path
 
-import cv2  # noqa: F401
 import numpy as np
 import pycolmap
 import pytest

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2  # noqa: F401  (before pycolmap, whose zlib symbols break it otherwise)
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
