@@ -1,0 +1,81 @@
+"""The state of a run: everything that a resumed run needs to continue as if it had never stopped."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from corrsfm.errors import CheckpointError
+from corrsfm.workspace import atomic_path
+
+__all__ = ["Average", "load_state", "save_state"]
+
+_FORMAT = "corrsfm-training-1"
+
+
+class Average:
+    """Exponential moving average of a network's weights and running statistics.
+
+    Parameters
+    ----------
+    network : Module
+    decay : float
+        Share of the past that a step keeps; early steps keep less, so that the start is soon forgotten.
+    """
+
+    def __init__(self, network: nn.Module, decay: float) -> None:
+        self._decay = decay
+        self._num_updates = 0
+        self._values = {name: value.detach().clone() for name, value in network.state_dict().items()}
+
+    @torch.no_grad()
+    def update(self, network: nn.Module) -> None:
+        """Take in the weights after a step."""
+        self._num_updates += 1
+        decay = min(self._decay, (1 + self._num_updates) / (10 + self._num_updates))
+        for name, value in network.state_dict().items():
+            if value.is_floating_point():
+                self._values[name].lerp_(value, 1 - decay)
+            else:
+                self._values[name].copy_(value)
+
+    def copy_to(self, network: nn.Module) -> None:
+        """Give a network the averaged weights."""
+        network.load_state_dict(self._values)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Values and number of updates."""
+        return {"num_updates": self._num_updates, "values": self._values}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self._num_updates = state["num_updates"]
+        for name, value in state["values"].items():
+            self._values[name].copy_(value)
+
+
+def save_state(path: Path, **state: dict[str, Any] | Tensor | int | float | str) -> None:
+    """Write the state of a run, whole or not at all."""
+    with atomic_path(Path(path)) as temporary:
+        torch.save({"format": _FORMAT, **state}, temporary)
+
+
+def load_state(path: Path, device: torch.device) -> dict[str, Any]:
+    """Read what `save_state` wrote.
+
+    Raises
+    ------
+    CheckpointError
+        If the file is missing or something else.
+    """
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError) as error:
+        raise CheckpointError(f"{path}: cannot be read as the state of a training run ({error})") from error
+    if not isinstance(state, dict) or state.get("format") != _FORMAT:
+        raise CheckpointError(f"{path}: not the state of a training run; start without --resume")
+    return state

@@ -1,0 +1,331 @@
+"""Real pairs → training batches, assembled on the training device.
+
+All pairs of a data set fit in the memory of any accelerator (a few bytes per match), so a batch is a handful
+of indexing operations on the device, without worker processes. What a batch holds depends only on the seed,
+the step and the rank: a resumed run sees the very batches that a straight run would have seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from corrsfm.compact import CompactScene, read_scenes
+from corrsfm.errors import InputError
+from corrsfm.geometry import essential_from_pose, relative_pose
+from corrsfm.oanet import pinhole_parameters
+from corrsfm.training.config import AugmentConfig
+from corrsfm.training.losses import THRESHOLD, epipolar_distance_sq
+
+__all__ = ["Batch", "RealPairs", "augment", "generator_for", "side_channels"]
+
+# A pair with fewer right matches has no label worth learning from.
+_MIN_INLIERS = 20
+
+
+@dataclass
+class Batch:
+    """B pairs of N correspondences.
+
+    Attributes
+    ----------
+    correspondences : (B, N, 4) float32
+        ``x0 y0 x1 y1`` normalised as inference would.
+    true_correspondences : (B, N, 4) float32
+        The same without lens distortion; what the matrix explains.
+    matrix : (B, 3, 3) float32
+        ``x1ᵀ F x0 = 0`` for right ``true_correspondences``; essential unless the intrinsics were jittered.
+    ratios, mutual, log_scale_ratios, rotations : (B, N) float32
+        Side information before it becomes channels.
+    mask : (B, N) bool
+        False for padding.
+    """
+
+    correspondences: Tensor
+    true_correspondences: Tensor
+    matrix: Tensor
+    ratios: Tensor
+    mutual: Tensor
+    log_scale_ratios: Tensor
+    rotations: Tensor
+    mask: Tensor
+
+    def distances(self) -> Tensor:
+        """Squared symmetric epipolar distances (B, N) to the truth."""
+        return epipolar_distance_sq(self.matrix, self.true_correspondences)
+
+    def __len__(self) -> int:
+        return len(self.matrix)
+
+
+def side_channels(batch: Batch, num_channels: int) -> Tensor | None:
+    """Side information (B, N, S) as `corrsfm.prune.side_information` lays it out, or None for no channels."""
+    if num_channels == 0:
+        return None
+    channels = [
+        batch.ratios,
+        batch.mutual,
+        batch.log_scale_ratios.clamp(-3.0, 3.0),
+        batch.rotations.cos(),
+        batch.rotations.sin(),
+    ]
+    return torch.stack(channels[:num_channels], dim=-1)
+
+
+def generator_for(seed: int, step: int, rank: int, device: torch.device, stream: int = 0) -> torch.Generator:
+    """The random generator of one step of one process; ``stream`` separates its uses."""
+    words = np.random.SeedSequence([seed, step, rank, stream]).generate_state(2, np.uint32)
+    return torch.Generator(device).manual_seed(int(words[0]) << 31 ^ int(words[1]))
+
+
+class RealPairs:
+    """Labelled pairs of compact files, kept on the device.
+
+    Parameters
+    ----------
+    scenes : sequence of CompactScene
+    device : torch.device
+    scene_power : float
+        A scene is drawn in proportion to its number of pairs to this power: 0 treats scenes alike, 1 treats
+        pairs alike.
+
+    Attributes
+    ----------
+    num_pairs : int
+    inlier_ratios : (P,) tensor
+    """
+
+    def __init__(
+        self, scenes: Sequence[CompactScene], device: torch.device, scene_power: float = 0.5
+    ) -> None:
+        self.device = device
+        self.scene_names = [scene.name for scene in scenes]
+        parts: dict[str, list[np.ndarray]] = {}
+        num_keys = num_matches = 0
+        for number, scene in enumerate(scenes):
+            arrays, matrices = _flatten(scene, num_keys, num_matches)
+            arrays["scene"] = np.full(len(scene.pairs), number)
+            arrays["matrix"] = matrices
+            for name, values in arrays.items():
+                parts.setdefault(name, []).append(values)
+            num_keys += len(scene.keypoints)
+            num_matches += len(arrays["key1"])
+        if not parts:
+            raise InputError("no scene to train on")
+        self._arrays = {
+            name: torch.from_numpy(np.concatenate(values)).to(device) for name, values in parts.items()
+        }
+        self.num_pairs = len(self._arrays["scene"])
+        self.inlier_ratios, num_inliers = self._count_inliers()
+        self._weights = self._pair_weights(num_inliers, scene_power)
+
+    @classmethod
+    def from_files(cls, paths: Sequence[Path], device: torch.device, scene_power: float = 0.5) -> RealPairs:
+        """Read compact files; see the class."""
+        return cls([scene for path in paths for scene in read_scenes(path)], device, scene_power)
+
+    def _count_inliers(self) -> tuple[Tensor, Tensor]:
+        ratios, counts = [], []
+        for start in range(0, self.num_pairs, 64):
+            pairs = torch.arange(start, min(start + 64, self.num_pairs), device=self.device)
+            width = int(self._arrays["num_matches"][pairs].max())
+            batch = self._gather(pairs, torch.arange(width, device=self.device).expand(len(pairs), -1))
+            right = (batch.distances() < THRESHOLD) & batch.mask
+            counts.append(right.sum(1))
+            ratios.append(right.sum(1) / batch.mask.sum(1).clamp(min=1))
+        return torch.cat(ratios), torch.cat(counts)
+
+    def _pair_weights(self, num_inliers: Tensor, scene_power: float) -> Tensor:
+        scene = self._arrays["scene"]
+        usable = num_inliers >= _MIN_INLIERS
+        if not usable.any():
+            raise InputError(
+                f"no pair has {_MIN_INLIERS} right matches; check the poses of the training scenes"
+            )
+        # Within a scene every fifth of the range of inlier ratios that occurs is drawn equally often.
+        level = (self.inlier_ratios.clamp(max=0.999) ** 0.5 * 5).long()
+        cell = scene * 5 + level
+        per_cell = torch.bincount(cell[usable], minlength=5 * len(self.scene_names)).double()
+        per_scene = torch.bincount(scene[usable], minlength=len(self.scene_names)).double()
+        levels = (per_cell.view(-1, 5) > 0).sum(1).clamp(min=1)
+        # Half of the draws follow the levels, half the pairs as they come.
+        share = 0.5 / (per_cell[cell] * levels[scene]).clamp(min=1) + 0.5 / per_scene[scene].clamp(min=1)
+        return torch.where(usable, share * per_scene[scene] ** scene_power, 0.0)
+
+    def _gather(self, pairs: Tensor, columns: Tensor) -> Batch:
+        """Matches ``columns`` (B, N) of ``pairs`` (B,); columns beyond a pair's matches are padding."""
+        a = self._arrays
+        mask = columns < a["num_matches"][pairs][:, None]
+        rows = a["match_start"][pairs][:, None] + torch.where(mask, columns, 0)
+        key0, key1 = a["key0"][rows].long(), a["key1"][rows].long()
+        pinhole = torch.cat([a["points"][key0], a["points"][key1]], -1)
+        return Batch(
+            correspondences=pinhole,
+            true_correspondences=pinhole + torch.cat([a["corrections"][key0], a["corrections"][key1]], -1),
+            matrix=a["matrix"][pairs],
+            ratios=a["ratios"][rows].float() / 255.0,
+            mutual=a["mutual"][rows].float(),
+            log_scale_ratios=(a["log_scales"][key1] - a["log_scales"][key0]).float(),
+            rotations=a["orientations"][key1] - a["orientations"][key0],
+            mask=mask,
+        )
+
+    def sample(
+        self, num_pairs: int, num_matches: int, config: AugmentConfig, generator: torch.Generator
+    ) -> Batch:
+        """Draw and augment a batch of ``num_pairs`` pairs of ``num_matches`` correspondences."""
+        pairs = torch.multinomial(self._weights, num_pairs, replacement=True, generator=generator)
+        available = self._arrays["num_matches"][pairs]
+        width = int(available.max())
+        # A random order of each pair's own matches, padding last; right matches may be thinned out by moving
+        # some of them to the end, which makes the pair as hard as a wider baseline would.
+        order = torch.rand(num_pairs, width, device=self.device, generator=generator)
+        columns = torch.arange(width, device=self.device)
+        if config.thin_probability > 0:
+            batch = self._gather(pairs, columns.expand(num_pairs, -1))
+            right = batch.distances() < THRESHOLD
+            draw = torch.rand(num_pairs, 2, 1, device=self.device, generator=generator)
+            keep = torch.where(draw[:, 0] < config.thin_probability, 0.15 + 0.85 * draw[:, 1], 1.0)
+            thinned = right & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)
+            order = order + thinned
+        order = order.masked_fill(columns >= available[:, None], torch.inf)
+        batch = self._gather(pairs, order.argsort(1)[:, :num_matches])
+        guess = self._arrays["guess"][pairs]
+        return augment(batch, guess, config, generator)
+
+
+def _flatten(
+    scene: CompactScene, first_key: int, first_match: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Arrays of a scene with indices into the concatenation of all scenes."""
+    images = range(len(scene.image_names))
+    points = [scene.normalised(image, undistorted=False) for image in images]
+    found = [scene.matched(index) for index in range(len(scene.pairs))]
+    counts = np.array([len(index0) for index0, _ in found], np.int64)
+    matched = [scene.match_offsets[index] + index0 for index, (index0, _) in enumerate(found)]
+    rows = np.concatenate(matched) if matched else np.zeros(0, np.int64)
+    key = [
+        np.concatenate(
+            [
+                first_key + scene.keypoint_offsets[scene.pairs[index, side]] + found[index][side]
+                for index in range(len(found))
+            ]
+        ).astype(np.int32)
+        for side in (0, 1)
+    ]
+    matrices, guesses = [], []
+    for image0, image1 in scene.pairs:
+        pose = relative_pose(
+            scene.rotations[image0],
+            scene.translations[image0],
+            scene.rotations[image1],
+            scene.translations[image1],
+        )
+        matrices.append(essential_from_pose(*pose))
+        guesses.append([_guess_factor(scene, int(image)) for image in (image0, image1)])
+    arrays = {
+        "points": np.concatenate(points).astype(np.float32),
+        "corrections": scene.corrections,
+        "log_scales": scene.log_scales.astype(np.float16),
+        "orientations": scene.orientations,
+        "key0": key[0],
+        "key1": key[1],
+        "ratios": np.round(scene.ratios[rows] * 255.0).astype(np.uint8),
+        "mutual": scene.mutual[rows],
+        "num_matches": counts,
+        "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
+        "guess": np.array(guesses, np.float32),
+    }
+    return arrays, np.array(matrices, np.float32)
+
+
+def _guess_factor(scene: CompactScene, image: int) -> float:
+    """True focal length over the one that is assumed when nothing is known, 1.2 times the longest side."""
+    camera = scene.cameras[image]
+    return pinhole_parameters(camera)[0] / (1.2 * max(camera.width, camera.height))
+
+
+def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch.Generator) -> Batch:
+    """Change what a pair of photos could as well have been, truth and side information included.
+
+    Parameters
+    ----------
+    batch : Batch
+    guess : (B, 2) tensor
+        True over assumed focal length of each image, used where the intrinsics are taken as unknown.
+    config : AugmentConfig
+    generator : torch.Generator
+
+    Returns
+    -------
+    Batch
+    """
+    device, num = batch.matrix.device, len(batch)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(num, *shape, device=device, generator=generator)
+
+    def chance(probability: float) -> Tensor:
+        return uniform() < probability
+
+    undistort = chance(config.undistort_probability)[:, None, None]
+    inputs = torch.where(undistort, batch.true_correspondences, batch.correspondences)
+    # In-plane turns: quarter turns of both photos together, small ones of each.
+    quarter = (
+        torch.where(chance(config.quarter_turn_probability), (uniform() * 3).floor() + 1, 0.0) * torch.pi / 2
+    )
+    small = torch.deg2rad((2 * uniform(2) - 1) * config.max_turn_deg)
+    angles = quarter[:, None] + torch.where(chance(config.turn_probability)[:, None], small, 0.0)
+    mirror = torch.where(chance(config.mirror_probability), -1.0, 1.0)
+    # Wrong intrinsics: the assumed focal length, or a jittered one; a shifted principal point.
+    jitter = torch.exp(config.focal_jitter * torch.randn(num, 2, device=device, generator=generator))
+    jitter = torch.where(chance(config.jitter_probability)[:, None], jitter, 1.0)
+    focal = torch.where(chance(config.unknown_focal_probability)[:, None], guess, jitter)
+    shift = config.principal_jitter * torch.randn(num, 2, 2, device=device, generator=generator)
+    shift = torch.where(chance(config.jitter_probability)[:, None, None], shift, 0.0)
+
+    transforms = _transforms(angles, mirror, focal, shift)
+    points = [_apply(transforms[:, side], inputs[..., 2 * side : 2 * side + 2]) for side in (0, 1)]
+    true = [
+        _apply(transforms[:, side], batch.true_correspondences[..., 2 * side : 2 * side + 2])
+        for side in (0, 1)
+    ]
+    inverse = torch.linalg.inv(transforms)
+    matrix = inverse[:, 1].transpose(1, 2) @ batch.matrix @ inverse[:, 0]
+    rotations = (batch.rotations + (angles[:, 1] - angles[:, 0])[:, None]) * mirror[:, None]
+
+    swap = chance(config.swap_probability)
+    flip, sign = swap[:, None, None], torch.where(swap, -1.0, 1.0)[:, None]
+    return Batch(
+        correspondences=torch.where(flip, torch.cat(points[::-1], -1), torch.cat(points, -1)),
+        true_correspondences=torch.where(flip, torch.cat(true[::-1], -1), torch.cat(true, -1)),
+        matrix=torch.where(flip, matrix.transpose(1, 2), matrix),
+        ratios=batch.ratios,
+        mutual=batch.mutual,
+        log_scale_ratios=batch.log_scale_ratios * sign,
+        rotations=rotations * sign,
+        mask=batch.mask,
+    )
+
+
+def _transforms(angles: Tensor, mirror: Tensor, focal: Tensor, shift: Tensor) -> Tensor:
+    """Affine maps (B, 2, 3, 3) of normalised coordinates of both images: turn, mirror, scale and shift."""
+    cosine, sine = angles.cos() * focal, angles.sin() * focal
+    zero, one = torch.zeros_like(cosine), torch.ones_like(cosine)
+    m = mirror[:, None]
+    rows = [
+        torch.stack([m * cosine, -m * sine, shift[..., 0]], -1),
+        torch.stack([sine, cosine, shift[..., 1]], -1),
+        torch.stack([zero, zero, one], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def _apply(transform: Tensor, points: Tensor) -> Tensor:
+    """Affine maps (B, 3, 3) of points (B, N, 2)."""
+    return points @ transform[:, :2, :2].transpose(1, 2) + transform[:, None, :2, 2]

@@ -1,0 +1,347 @@
+"""The training loop: draw a batch, step, average, and now and then log, validate and save.
+
+With ``torchrun`` every process trains on its own device on its own batches, gradients are averaged, and
+process 0 writes. A run bounded by time follows the clock: the share of the time that is used up drives the
+schedule, so that the learning rate reaches zero when the time does. A run folder holds ``recipe.json``
+(options, seed, versions), ``log.csv``, ``validation.csv``, ``state.pt`` (everything that resuming needs) and
+``latest.pt`` (averaged weights).
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from corrsfm import __version__
+from corrsfm.config import from_dict, to_dict
+from corrsfm.errors import ConfigError
+from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
+from corrsfm.training.checkpoint import Average, load_state, save_state
+from corrsfm.training.config import Schedule, TrainRecipe
+from corrsfm.training.dataset import Batch, RealPairs, generator_for, side_channels
+from corrsfm.training.losses import classification_loss, essential_loss, virtual_points
+from corrsfm.training.validation import Validation
+
+__all__ = ["Trainer", "learning_rate_factor", "train"]
+
+logger = logging.getLogger(__name__)
+
+
+def learning_rate_factor(progress: float, warm_up: float, schedule: Schedule) -> float:
+    """Share of the largest learning rate at a progress in [0, 1].
+
+    Parameters
+    ----------
+    progress : float
+    warm_up : float
+        Share of the run in which the rate rises.
+    schedule : Schedule
+        One-cycle rises along a cosine from 1/25, cosine along a line from zero; both fall along a cosine.
+    """
+    if progress < warm_up:
+        rising = progress / warm_up
+        if schedule is Schedule.ONE_CYCLE:
+            return 0.04 + 0.96 * 0.5 * (1 - math.cos(math.pi * rising))
+        return rising
+    falling = min((progress - warm_up) / max(1 - warm_up, 1e-9), 1.0)
+    return 0.5 * (1 + math.cos(math.pi * falling))
+
+
+def train(
+    recipe: TrainRecipe,
+    *,
+    device: torch.device,
+    resume: bool = False,
+    on_log: Callable[[dict[str, Any]], None] | None = None,
+) -> Path:
+    """Run a recipe to its end.
+
+    Parameters
+    ----------
+    recipe : TrainRecipe
+    device : torch.device
+        Replaced by the process's own GPU under ``torchrun``.
+    resume : bool
+        Continue the run in the output folder, if there is one.
+    on_log : callable, optional
+        Called with every line of the log.
+
+    Returns
+    -------
+    Path
+        The averaged weights.
+    """
+    with _process_group(device) as (rank, own_device):
+        data = RealPairs.from_files(recipe.train.train_files, own_device, recipe.train.scene_power)
+        trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
+        if resume and trainer.state_path.exists():
+            trainer.load()
+        return trainer.run()
+
+
+@contextmanager
+def _process_group(device: torch.device) -> Iterator[tuple[int, torch.device]]:
+    """Rank and device of this process; joins the processes that ``torchrun`` started."""
+    if "RANK" not in os.environ:
+        yield 0, device
+        return
+    backend = "nccl" if device.type == "cuda" else "gloo"
+    torch.distributed.init_process_group(backend)
+    if device.type == "cuda":
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+        torch.cuda.set_device(device)
+    try:
+        yield torch.distributed.get_rank(), device
+    finally:
+        torch.distributed.destroy_process_group()
+
+
+class Trainer:
+    """One run: network, optimiser, average and the place they are saved to.
+
+    Parameters
+    ----------
+    recipe : TrainRecipe
+    data : RealPairs
+    device : torch.device
+    rank : int
+        Number of this process; process 0 writes.
+    on_log : callable, optional
+    """
+
+    def __init__(
+        self,
+        recipe: TrainRecipe,
+        data: RealPairs,
+        device: torch.device,
+        *,
+        rank: int = 0,
+        on_log: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.recipe, self.config, self.data, self.device, self.rank = recipe, recipe.train, data, device, rank
+        self._on_log = on_log
+        torch.manual_seed(self.config.seed)
+        network_config = from_dict(NetworkConfig, recipe.network, "network")
+        self.network = CorrAdaptor.from_config(network_config).to(device)
+        self.average = Average(self.network, self.config.ema_decay)
+        self.optimiser = torch.optim.AdamW(
+            _parameter_groups(self.network, self.config.weight_decay), lr=self.config.learning_rate
+        )
+        self._model: nn.Module = self.network
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            self._model = nn.parallel.DistributedDataParallel(self.network, find_unused_parameters=True)
+        if self.config.compile:
+            self._model = cast(nn.Module, torch.compile(self._model))
+        self.step = self.num_skipped = 0
+        self.minutes = 0.0
+        self._validation: Validation | None = None
+        self.config.output.mkdir(parents=True, exist_ok=True)
+        self.state_path = self.config.output / "state.pt"
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, in [0, 1]."""
+        if self.config.max_minutes > 0:
+            return min(self.minutes / self.config.max_minutes, 1.0)
+        return min(self.step / self.config.max_steps, 1.0)
+
+    def run(self) -> Path:
+        """Train to the end; returns the path of the averaged weights."""
+        if self.rank == 0:
+            self._write_recipe()
+        started = time.monotonic() - 60.0 * self.minutes
+        last = {"save": self.minutes, "validate": self.minutes}
+        sums: dict[str, float] = {}
+        while (progress := self._agreed_progress()) < 1.0:
+            losses = self.train_step(progress)
+            self.minutes = (time.monotonic() - started) / 60.0
+            for name, value in losses.items():
+                sums[name] = sums.get(name, 0.0) + value
+            if self.step % self.config.log_every == 0:
+                self._log({name: value / self.config.log_every for name, value in sums.items()}, progress)
+                sums = {}
+            if self.rank == 0 and self.minutes - last["save"] >= self.config.checkpoint_minutes:
+                self.save()
+                last["save"] = self.minutes
+            if self.rank == 0 and self.minutes - last["validate"] >= self.config.validate_minutes:
+                self.validate()
+                last["validate"] = self.minutes
+        if self.rank == 0:
+            self.save()
+            self.validate()
+        return self.config.output / "latest.pt"
+
+    def _agreed_progress(self) -> float:
+        """Progress, that of process 0 for all: clocks differ, and all must stop at the same step."""
+        if self._model is self.network or not torch.distributed.is_initialized():
+            return self.progress
+        shared = torch.tensor([self.progress], dtype=torch.float64, device=self.device)
+        torch.distributed.broadcast(shared, 0)
+        return float(shared)
+
+    def train_step(self, progress: float) -> dict[str, float]:
+        """One step; returns its losses, nothing if the step was skipped."""
+        config = self.config
+        rate = config.learning_rate * learning_rate_factor(progress, config.warm_up, config.schedule)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        batch = self.draw(self.step)
+        self._model.train()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss, parts = self.loss(batch, with_essential=progress >= config.essential_start)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), config.max_gradient_norm)
+        self.step += 1
+        if not bool(torch.isfinite(norm)):
+            self.num_skipped += 1
+            return {}
+        self.optimiser.step()
+        self.average.update(self.network)
+        return {"loss": float(loss.detach()), **parts, "gradient": float(norm)}
+
+    def draw(self, step: int) -> Batch:
+        """The batch of a step, a function of seed, step and rank only."""
+        config = self.config
+        generator = generator_for(config.seed, step, self.rank, self.device)
+        return self.data.sample(config.batch_size, config.num_matches, self.recipe.augment, generator)
+
+    def loss(self, batch: Batch, *, with_essential: bool) -> tuple[Tensor, dict[str, float]]:
+        """The hybrid loss of a batch and its parts."""
+        mask = None if bool(batch.mask.all()) else batch.mask
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
+            output = self._model(
+                batch.correspondences, side_channels(batch, self.network.side_channels), mask
+            )
+        distances = batch.distances()
+        steps = [distances.gather(1, indices) for indices in output.indices]
+        masks = None if mask is None else [logits.isfinite() for logits in output.logits]
+        logits = [logits.float() for logits in output.logits]
+        total = classification_loss(logits, steps, masks, self.config.threshold)
+        parts = {"classification": float(total.detach())}
+        if with_essential:
+            essential = essential_loss(output.essential.float(), virtual_points(batch.matrix))
+            total = total + self.config.essential_weight * essential
+            parts["essential"] = float(essential.detach())
+        return total, parts
+
+    def save(self) -> None:
+        """Write the state of the run and the averaged weights."""
+        save_state(
+            self.state_path,
+            step=self.step,
+            minutes=self.minutes,
+            num_skipped=self.num_skipped,
+            network=self.network.state_dict(),
+            average=self.average.state_dict(),
+            optimiser=self.optimiser.state_dict(),
+            random=torch.get_rng_state(),
+            network_config=json.dumps(to_dict(self.network.config)),
+        )
+        save_network(self._averaged(), self.config.output / "latest.pt", provenance=self._provenance())
+
+    def load(self) -> None:
+        """Continue from the last state in the run's folder."""
+        state = load_state(self.state_path, self.device)
+        if state["network_config"] != json.dumps(to_dict(self.network.config)):
+            raise ConfigError(
+                f"{self.state_path}: is of another network; use another --output or the same recipe"
+            )
+        self.network.load_state_dict(state["network"])
+        self.average.load_state_dict(state["average"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        torch.set_rng_state(state["random"].cpu())
+        self.step, self.minutes, self.num_skipped = state["step"], state["minutes"], state["num_skipped"]
+
+    def validate(self) -> dict[str, Any] | None:
+        """Scores of the averaged weights on the validation pairs, appended to ``validation.csv``."""
+        if self.config.val_file is None:
+            return None
+        if self._validation is None:
+            self._validation = Validation(self.config.val_file, self.config.val_pairs_per_scene)
+            logger.info("ratio + mutual + LO-RANSAC: AUC@5 %.2f", self._validation.baseline["auc5"])
+        result = self._validation.run(self._averaged(), self.device)
+        row = {"step": self.step, "minutes": round(self.minutes, 2)}
+        row |= {
+            name: round(result[name], 3) for name in ("auc5", "auc10", "auc20", "precision", "recall", "f")
+        }
+        row["baseline_auc5"] = round(self._validation.baseline["auc5"], 3)
+        row |= {f"auc5_{scene}": round(value, 3) for scene, value in result["by_scene"].items()}
+        _append_csv(self.config.output / "validation.csv", row)
+        if self._on_log:
+            self._on_log(row)
+        return result
+
+    def _averaged(self) -> CorrAdaptor:
+        assert self.network.config is not None
+        network = CorrAdaptor.from_config(self.network.config).to(self.device)
+        if self.config.ema_decay > 0:
+            self.average.copy_to(network)
+        else:
+            network.load_state_dict(self.network.state_dict())
+        return network.eval()
+
+    def _log(self, losses: dict[str, float], progress: float) -> None:
+        if self.rank != 0:
+            return
+        row: dict[str, Any] = {
+            "step": self.step,
+            "minutes": round(self.minutes, 3),
+            "progress": round(progress, 5),
+        }
+        row["learning_rate"] = self.optimiser.param_groups[0]["lr"]
+        row |= {
+            name: losses.get(name, float("nan"))
+            for name in ("loss", "classification", "essential", "gradient")
+        }
+        row["skipped"] = self.num_skipped
+        _append_csv(self.config.output / "log.csv", row)
+        if self._on_log:
+            self._on_log(row)
+
+    def _provenance(self) -> dict[str, Any]:
+        return {
+            "scenes": list(self.data.scene_names),
+            "num_pairs": self.data.num_pairs,
+            "steps": self.step,
+            "minutes": round(self.minutes, 1),
+            "seed": self.config.seed,
+            "recipe": json.loads(json.dumps(to_dict(self.recipe), default=str)),
+            "hardware": f"{self.device.type}, {platform.machine()}, {torch.get_num_threads()} threads",
+            "versions": {"corrsfm": __version__, "torch": torch.__version__, "numpy": np.__version__},
+        }
+
+    def _write_recipe(self) -> None:
+        (self.config.output / "recipe.json").write_text(
+            json.dumps(self._provenance(), indent=1, default=str) + "\n", encoding="utf-8"
+        )
+
+
+def _parameter_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
+    """Matrices decay, biases and scales do not."""
+    trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    return [
+        {"params": [parameter for parameter in trained if parameter.ndim > 1], "weight_decay": weight_decay},
+        {"params": [parameter for parameter in trained if parameter.ndim <= 1], "weight_decay": 0.0},
+    ]
+
+
+def _append_csv(path: Path, row: dict[str, Any]) -> None:
+    new = not path.exists()
+    with path.open("a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, row)
+        if new:
+            writer.writeheader()
+        writer.writerow(row)

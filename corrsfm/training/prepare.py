@@ -1,0 +1,242 @@
+"""Photo scenes with cameras → labelled pairs.
+
+A scene is a folder with ``images/`` and a COLMAP model (text or binary) beside it or in ``sparse/0`` or
+``model``. The pairs come from ``covisibility.txt`` (``name0 name1 count``) if there is one, else from the
+model's points. What the features and matches are is decided by the same stages that inference runs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import cv2  # before pycolmap
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.cameras import camera_from_pycolmap, normalise_points
+from corrsfm.compact import NO_NEIGHBOUR, CompactScene, write_scenes
+from corrsfm.errors import ImageError, InputError
+from corrsfm.features import extract_features
+from corrsfm.matches import match_features
+from corrsfm.oanet import pinhole_parameters
+from corrsfm.training.config import PrepareConfig
+from corrsfm.types import Camera, Features
+
+__all__ = ["choose_pairs", "prepare_file", "prepare_scene", "read_splits"]
+
+# Fewer matches than this determine no essential matrix and teach nothing.
+_MIN_KEYPOINTS = 20
+
+
+@dataclass(frozen=True)
+class _SceneModel:
+    """What a reconstruction says about the photos of a scene, sorted by name."""
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    covisible: dict[tuple[int, int], int]
+
+
+def read_splits(path: Path) -> dict[str, list[str]]:
+    """Read scene names by split from JSON and check that no scene is in two splits.
+
+    Raises
+    ------
+    InputError
+        If the file is no such list or a scene is named twice.
+    """
+    try:
+        splits = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as JSON of scene names by split ({error})") from error
+    if not isinstance(splits, dict) or not all(isinstance(names, list) for names in splits.values()):
+        raise InputError(f"{path}: expected an object with a list of scene names for each split")
+    repeated = [
+        name for name, count in Counter(n for names in splits.values() for n in names).items() if count > 1
+    ]
+    if repeated:
+        raise InputError(f"{path}: scenes named more than once: {', '.join(sorted(repeated))}")
+    return splits
+
+
+def choose_pairs(covisible: dict[tuple[int, int], int], max_pairs: int, seed: int) -> list[tuple[int, int]]:
+    """Choose pairs with a spread of difficulty: equally many from each tenth of the covisibility counts.
+
+    Parameters
+    ----------
+    covisible : dict
+        Shared points by photo indices.
+    max_pairs : int
+        Largest number of pairs; 0 takes all.
+    seed : int
+
+    Returns
+    -------
+    list of tuple of int
+        Sorted.
+    """
+    ranked = sorted(covisible, key=lambda pair: (covisible[pair], pair))
+    if max_pairs == 0 or len(ranked) <= max_pairs:
+        return sorted(ranked)
+    rng = np.random.default_rng(seed)
+    # One pair from each of `max_pairs` equal stretches of the ranking.
+    edges = np.linspace(0, len(ranked), max_pairs + 1)
+    chosen = [
+        ranked[rng.integers(int(low), max(int(high), int(low) + 1))]
+        for low, high in zip(edges, edges[1:], strict=False)
+    ]
+    return sorted(set(chosen))
+
+
+def prepare_file(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> Iterator[tuple[str, int]]:
+    """Prepare scenes into one compact file; yields each scene's name and number of pairs as it is done."""
+    done: list[tuple[str, int]] = []
+
+    def prepared() -> Iterator[CompactScene]:
+        for folder in scenes:
+            scene = prepare_scene(folder, config)
+            done.append((scene.name, len(scene.pairs)))
+            yield scene
+
+    write_scenes(output, prepared())
+    yield from done
+
+
+def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
+    """Features, matches and ground truth of one scene.
+
+    Raises
+    ------
+    InputError
+        If the folder holds no model or no overlapping pair.
+    """
+    folder = Path(folder)
+    model = _read_model(folder)
+    features = [
+        _features(folder / "images" / name, camera, config)
+        for name, camera in zip(model.names, model.cameras, strict=True)
+    ]
+    usable = {
+        pair: count
+        for pair, count in model.covisible.items()
+        if count >= config.min_covisible and min(len(features[index]) for index in pair) >= _MIN_KEYPOINTS
+    }
+    if not usable:
+        raise InputError(
+            f"{folder}: no pair of photos shares {config.min_covisible} points; give more photos"
+        )
+    pairs = choose_pairs(usable, config.max_pairs_per_scene, config.seed)
+    neighbours, ratios, mutual = [], [], []
+    for index0, index1 in pairs:
+        matches = match_features(features[index0].descriptors, features[index1].descriptors)
+        row = np.full(len(features[index0]), NO_NEIGHBOUR, np.uint16)
+        row[matches.indices[:, 0]] = matches.indices[:, 1]
+        ratio, both = np.ones(len(row), np.float32), np.zeros(len(row), bool)
+        ratio[matches.indices[:, 0]], both[matches.indices[:, 0]] = matches.ratios, matches.mutual
+        neighbours.append(row)
+        ratios.append(ratio)
+        mutual.append(both)
+    corrections = [
+        _corrections(camera, each.keypoints) for camera, each in zip(model.cameras, features, strict=True)
+    ]
+    return CompactScene(
+        name=folder.name,
+        image_names=model.names,
+        cameras=model.cameras,
+        rotations=model.rotations,
+        translations=model.translations,
+        keypoint_offsets=_offsets(features),
+        keypoints=np.concatenate([each.keypoints for each in features]),
+        corrections=np.concatenate(corrections),
+        log_scales=np.log(np.concatenate([each.scales for each in features])),
+        orientations=np.concatenate([each.orientations for each in features]),
+        pairs=np.array(pairs, np.int64),
+        covisible=np.array([usable[pair] for pair in pairs], np.int64),
+        match_offsets=_offsets(neighbours),
+        neighbours=np.concatenate(neighbours),
+        ratios=np.concatenate(ratios),
+        mutual=np.concatenate(mutual),
+    )
+
+
+def _offsets(parts: list) -> NDArray[np.int64]:
+    return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise ImageError(f"{path}: cannot be read as a photo")
+    if image.shape != (camera.height, camera.width):
+        raise ImageError(
+            f"{path}: is {image.shape[1]} × {image.shape[0]} pixels, "
+            f"its camera says {camera.width} × {camera.height}"
+        )
+    return extract_features(
+        image.astype(np.uint8), max_features=config.max_features, max_image_size=config.max_image_size
+    )
+
+
+def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Undistorted minus pinhole normalised coordinates (N, 2)."""
+    fx, fy, cx, cy = pinhole_parameters(camera)
+    pixels = keypoints.astype(np.float64)
+    undistorted = normalise_points(camera, pixels)
+    # A model of strong distortion may have no ray for a corner of the photo; such a point keeps its pinhole
+    # ray, its label is then "far from the line", which is what inference would find too.
+    pinhole = (pixels - [cx, cy]) / [fx, fy]
+    return np.nan_to_num(undistorted - pinhole, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+
+
+def _read_model(folder: Path) -> _SceneModel:
+    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "model"):
+        if any((place / f"cameras{suffix}").exists() for suffix in (".txt", ".bin")):
+            reconstruction = pycolmap.Reconstruction(place)
+            break
+    else:
+        raise InputError(
+            f"{folder}: holds no COLMAP model (cameras.txt or cameras.bin), nor does its sparse/0 or model"
+        )
+    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
+    names = tuple(image.name for image in images)
+    poses = [image.cam_from_world() for image in images]
+    cameras = tuple(
+        replace(camera_from_pycolmap(reconstruction.cameras[image.camera_id]), has_prior_focal_length=True)
+        for image in images
+    )
+    return _SceneModel(
+        names=names,
+        cameras=cameras,
+        rotations=np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3),
+        translations=np.array([pose.translation for pose in poses]).reshape(-1, 3),
+        covisible=_covisible(folder / "covisibility.txt", names, reconstruction),
+    )
+
+
+def _covisible(
+    path: Path, names: tuple[str, ...], reconstruction: pycolmap.Reconstruction
+) -> dict[tuple[int, int], int]:
+    """Shared points by photo indices, smaller index first."""
+    number = {name: index for index, name in enumerate(names)}
+    counts: Counter[tuple[int, int]] = Counter()
+    if path.exists():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            fields = line.rsplit(maxsplit=2)
+            if not line.startswith("#") and len(fields) == 3 and fields[0] in number and fields[1] in number:
+                index0, index1 = sorted((number[fields[0]], number[fields[1]]))
+                counts[index0, index1] = int(fields[2])
+        return dict(counts)
+    for point in reconstruction.points3D.values():
+        seen = sorted(
+            {number[reconstruction.images[element.image_id].name] for element in point.track.elements}
+        )
+        counts.update(combinations(seen, 2))
+    return dict(counts)
