@@ -1,0 +1,90 @@
+"""The command that measures the network's speed and memory."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import click
+
+from corrsfm.cli.options import echo_json, json_option, run_options
+from corrsfm.config import Precision, RunConfig
+
+__all__ = ["bench"]
+
+
+@click.command()
+@click.option(
+    "--model",
+    type=click.Path(path_type=Path),
+    help="Checkpoint; the published architecture if not given.",
+)
+@click.option(
+    "--num-matches",
+    "sizes",
+    type=click.IntRange(min=32),
+    multiple=True,
+    default=(500, 1000, 2000),
+    show_default=True,
+    help="Matches a pair; give it several times.",
+)
+@click.option(
+    "--batch-size",
+    "batch_sizes",
+    type=click.IntRange(min=1),
+    multiple=True,
+    default=(1,),
+    show_default=True,
+    help="Pairs at a time; give it several times.",
+)
+@click.option(
+    "--precision",
+    "precisions",
+    type=click.Choice(["float32", "bfloat16"]),
+    multiple=True,
+    default=("float32", "bfloat16"),
+    show_default=True,
+    help="Number formats.",
+)
+@click.option(
+    "--compile/--no-compile", default=False, show_default=True, help="Also measure the compiled network."
+)
+@click.option(
+    "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timed repetitions."
+)
+@run_options
+@json_option
+def bench(
+    model: Path | None,
+    sizes: tuple[int, ...],
+    batch_sizes: tuple[int, ...],
+    precisions: tuple[str, ...],
+    compile: bool,
+    repeats: int,
+    run: RunConfig,
+    as_json: bool,
+) -> None:
+    """Measure the network's speed and memory beside the published network, written plainly.
+
+    Numbers marked × are ratios to that reference on the same matches: of pairs per second, and of peak
+    memory.
+    """  # fmt: skip
+    from corrsfm.benchmark import format_rows, run_benchmark
+    from corrsfm.machine import device_of, use_threads
+
+    use_threads(run)
+    devices = sorted({"cpu", device_of(run)}) if run.device == "auto" else [device_of(run)]
+    rows = run_benchmark(
+        model=model,
+        devices=devices,
+        sizes=sizes,
+        batch_sizes=batch_sizes,
+        precisions=[Precision(name) for name in precisions],
+        compile=compile,
+        repeats=repeats,
+        seed=run.seed,
+    )
+    if as_json:
+        echo_json([dataclasses.asdict(row) for row in rows])
+    else:
+        click.echo(format_rows(rows))
