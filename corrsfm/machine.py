@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import itertools
 import os
@@ -75,12 +76,10 @@ def threaded(work: Callable[[K], R], keys: Iterable[K], run: RunConfig) -> Itera
                 future.cancel()
 
 
-def versions() -> dict[str, str]:
-    """Versions of corrsfm, Python and the packages that results depend on."""
+def versions(packages: Iterable[str] = RECORDED_PACKAGES) -> dict[str, str]:
+    """Versions of corrsfm, Python and those of the packages that are installed."""
     found = {"corrsfm": __version__, "python": platform.python_version()}
-    for package in RECORDED_PACKAGES:
-        try:
+    for package in packages:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            found[package] = "unknown"
     return found

@@ -17,7 +17,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from corrsfm.machine import versions
+from corrsfm.evaluation.records import provenance, save_results
 
 PLAIN = """
 import sys
@@ -55,7 +55,7 @@ def largest_model(folder: Path) -> dict[str, float]:
 
     models = [pycolmap.Reconstruction(path.parent) for path in folder.rglob("images.bin")]
     if not models:
-        return {"registered": 0, "points": 0, "median_error_px": float("nan")}
+        return {"registered": 0, "points": 0, "median_error_px": None}
     summary = summarise_model(max(models, key=lambda model: model.num_reg_images()))
     return {
         "registered": len(summary.image_names),
@@ -96,14 +96,15 @@ def main() -> None:
                 row = {"scene": scene, "photos": num_photos, "method": method, **largest_model(out)}
                 rows.append({**row, "seconds": wall, "processor_seconds": processor})
                 print(json.dumps(rows[-1]), file=sys.stderr)
-    record = {
-        "kind": "against_pycolmap",
-        "command": "python pipelines/against_pycolmap.py " + " ".join(sys.argv[1:]),
-        "versions": versions(),
-        "rows": rows,
-    }
-    arguments.results.parent.mkdir(parents=True, exist_ok=True)
-    arguments.results.write_text(json.dumps(record, indent=2) + "\n")
+        save_results(
+            arguments.results,
+            "pycolmap",
+            {
+                "provenance": provenance(seed=0, command="python " + " ".join(sys.argv)),
+                "subject": {"max_features": arguments.max_features},
+                "rows": rows,
+            },
+        )
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import click
 
 from corrsfm import __version__
 from corrsfm.cli.batch import batch
+from corrsfm.cli.bench import bench
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
@@ -70,5 +71,5 @@ def main(quiet: bool) -> None:
         os.environ["TQDM_DISABLE"] = "1"
 
 
-for _command in (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate):
+for _command in (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate, bench):
     main.add_command(_command)

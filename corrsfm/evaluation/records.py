@@ -8,7 +8,6 @@ only what is new or changed.
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -16,8 +15,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-import corrsfm
 from corrsfm.errors import InputError
+from corrsfm.machine import versions
 from corrsfm.workspace import atomic_write_text
 
 __all__ = ["file_sha256", "kept_methods", "load_results", "provenance", "save_results"]
@@ -28,14 +27,8 @@ _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap", "poselib", "torch",
 
 def provenance(*, seed: int, command: str = "", device: str = "cpu") -> dict[str, Any]:
     """Versions, machine, seed and command of a measurement."""
-    versions = {"corrsfm": corrsfm.__version__, "python": platform.python_version()}
-    for library in _LIBRARIES:
-        try:
-            versions[library] = importlib.metadata.version(library)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return {
-        "versions": versions,
+        "versions": versions(_LIBRARIES),
         "machine": {
             "system": f"{platform.system()} {platform.machine()}",
             "processor": _processor(),

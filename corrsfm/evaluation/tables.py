@@ -114,6 +114,36 @@ def _compare_table(values: dict[str, Any]) -> str:
     return f"{_markdown(header, rows)}\n\n{_origin(values)}"
 
 
+def _pycolmap_table(values: dict[str, Any]) -> str:
+    header = [
+        "scene",
+        "photos",
+        "method",
+        "registered",
+        "points",
+        "median error px",
+        "seconds",
+        "CPU seconds",
+    ]
+    rows = [
+        [
+            row["scene"],
+            str(row["photos"]),
+            row["method"],
+            str(row["registered"]),
+            str(row["points"]),
+            _number(row["median_error_px"], 2),
+            _number(row["seconds"]),
+            _number(row["processor_seconds"]),
+        ]
+        for row in values["rows"]
+    ]
+    caption = (
+        f"Up to {values['subject']['max_features']} features a photo, exhaustive pairs. {_origin(values)}"
+    )
+    return f"{_markdown(header, rows)}\n\n{caption}"
+
+
 def _origin(values: dict[str, Any]) -> str:
     """Where a table comes from: versions and seed, for a caption."""
     versions = values["provenance"]["versions"]
@@ -134,6 +164,7 @@ _RENDERERS: dict[str, Callable[[dict[str, Any]], str]] = {
     "pose": _pose_table,
     "homography": _homography_table,
     "compare": _compare_table,
+    "pycolmap": _pycolmap_table,
 }
 
 
