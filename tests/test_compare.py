@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pycolmap
 import pytest
+from click.testing import CliRunner
 from photos import write_photos
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
+from corrsfm.cli import main
 from corrsfm.errors import ConfigError
 from corrsfm.evaluation.compare import compare_methods, method_folder, share_matches
 from corrsfm.evaluation.records import load_results
@@ -142,3 +144,8 @@ def test_methods_that_cannot_be_compared_are_refused(tmp_path: Path, methods: li
 def test_folder_names_are_safe():
     assert method_folder("corradaptor@pose:/models/a b.pt") == "corradaptor_pose_models_a_b.pt"
     assert method_folder("../") == "_"
+
+
+def test_command_refuses_the_flag_for_a_single_method(tmp_path: Path):
+    result = CliRunner().invoke(main, ["compare", str(tmp_path), "--method", "ratio"])
+    assert result.exit_code == 2 and "--methods" in result.output

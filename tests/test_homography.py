@@ -5,7 +5,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from corrsfm.cli import main
 from corrsfm.errors import InputError
 from corrsfm.evaluation.homography import (
     EXCLUDED_SEQUENCES,
@@ -118,3 +120,18 @@ def test_folders_that_are_no_hpatches_are_explained(tmp_path: Path):
         _write(tmp_path / "v_a" / f"{number}.png", _texture())
     with pytest.raises(InputError, match=r"H_1_2: not a homography"):
         load_sequence(tmp_path / "v_a")
+
+
+def test_command_prints_the_table(folder: Path, tmp_path: Path):
+    command = [
+        "evaluate",
+        "homography",
+        str(folder),
+        "--filter",
+        "oracle",
+        "--results",
+        str(tmp_path / "h.json"),
+    ]
+    result = CliRunner().invoke(main, command)
+    assert result.exit_code == 0, result.output
+    assert "| oracle |" in result.output and "2 sequences." in result.output

@@ -7,7 +7,9 @@ import cv2  # noqa: F401  (before pycolmap)
 import numpy as np
 import pycolmap
 import pytest
+from click.testing import CliRunner
 
+from corrsfm.cli import main
 from corrsfm.errors import InputError
 from corrsfm.evaluation.scene import evaluate_scene, find_model, read_poses, score_poses
 
@@ -118,3 +120,16 @@ def test_what_cannot_be_compared_is_explained(truth_dir: Path, tmp_path: Path):
     (tmp_path / "b.jpg.json").write_text("{}")
     with pytest.raises(InputError, match=r"b\.jpg\.json: not a camera file"):
         read_poses(tmp_path)
+
+
+def test_command_prints_the_score(truth_dir: Path, tmp_path: Path):
+    model = _moved(truth_dir, tmp_path / "model", keep=2)
+    command = ["evaluate", "scene", str(model), "--ground-truth", str(truth_dir)]
+    text = CliRunner().invoke(main, command)
+    assert text.exit_code == 0, text.output
+    assert "registered          2 of 8 photos" in text.output
+    assert "undetermined: fewer than 3 registered photos" in text.output
+    values = json.loads(CliRunner().invoke(main, [*command, "--json"]).stdout)
+    assert values == evaluate_scene(model, truth_dir).to_dict()
+    full = CliRunner().invoke(main, ["evaluate", "scene", str(truth_dir), "--ground-truth", str(truth_dir)])
+    assert "pose AUC@1°         100.0 %" in full.output and "% of its extent" in full.output

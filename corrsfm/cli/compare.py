@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
 from corrsfm.cli.evaluate import command_line
 from corrsfm.cli.options import echo_json, json_option, overwrite_option, pipeline_options
@@ -48,6 +49,9 @@ def compare(
     Features and matches are made once. The table goes to standard output, the page with the pairs that differ
     most to OUTPUT/compare.html.
     """
+    source = click.get_current_context().get_parameter_source("method")
+    if source is ParameterSource.COMMANDLINE:
+        raise click.UsageError("--method chooses one method; name those to compare with --methods")
     from corrsfm.evaluation.compare import compare_methods
     from corrsfm.evaluation.tables import render_table
 
