@@ -7,6 +7,7 @@ mask and keypoints must speak of the same frame.
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 import unicodedata
 from collections import Counter, defaultdict
@@ -46,6 +47,8 @@ __all__ = [
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 MAX_NAMED = 5
+
+logger = logging.getLogger("corrsfm")
 
 
 def index_images(
@@ -94,9 +97,14 @@ def index_images(
     with ThreadPoolExecutor(threads) as pool:
         results = list(pool.map(read, names))
     unreadable = [str(result) for result in results if isinstance(result, ImageError)]
-    if unreadable:
-        raise ImageError("\n".join(unreadable))
+    if unreadable and not config.skip_unreadable:
+        raise ImageError("\n".join(unreadable) + "\n--skip-unreadable goes on without such photos")
+    for text in unreadable:
+        logger.warning("left out: %s", text)
+    names = [n for n, result in zip(names, results, strict=True) if not isinstance(result, ImageError)]
     found = [result for result in results if not isinstance(result, ImageError)]
+    if len(names) < 2:
+        raise InputError(f"{folder}: only {len(names)} photos can be read; at least two are needed")
     cameras, camera_ids = assign_cameras(
         names,
         [info for _, info in found],

@@ -124,7 +124,7 @@ def extract_features(
         for name, result in threaded(work, missing, run):
             if isinstance(result, Features):
                 yield name, result
-            elif config.skip_unreadable:
+            elif images.config.get("skip_unreadable"):
                 logger.warning("left out: %s", result)
                 yield name, _no_features(index, records[name])
             else:

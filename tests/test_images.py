@@ -255,3 +255,14 @@ def test_photos_with_the_same_bytes_are_found(folder: Path) -> None:
     (folder / "sub" / "copy.jpg").write_bytes((folder / "b.jpg").read_bytes())
     records, _ = index_images(folder, ImagesConfig())
     assert duplicate_images(records) == [("b.jpg", "copy.jpg", "sub/copy.jpg")]
+
+
+def test_unreadable_photos_are_left_out_on_request(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((20, 30), np.uint8))
+    (tmp_path / "broken.jpg").write_bytes(b"")
+    with pytest.raises(ImageError, match=r"broken\.jpg[\s\S]*--skip-unreadable"):
+        index_images(tmp_path, ImagesConfig())
+    records, _ = index_images(tmp_path, ImagesConfig(skip_unreadable=True))
+    assert [record.name for record in records] == ["a.png", "b.png"]
+    assert "broken.jpg" in caplog.text

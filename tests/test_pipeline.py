@@ -293,3 +293,10 @@ def test_same_input_gives_same_bytes(tmp_path: Path, photos: Path) -> None:
         values.append(contents(workspace))
     assert values[0] == values[1]
     assert any(np.frombuffer(value, np.int32).size for key, value in values[0].items() if key[:2] == "p ")  # type: ignore[arg-type]
+
+
+def test_a_truncated_photo_is_left_out_on_request(workspace: Workspace, photos: Path) -> None:
+    whole = (photos / "2.png").read_bytes()
+    (photos / "2.png").write_bytes(whole[: len(whole) // 2])
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
+    assert pipeline.extract_features(workspace, SMALL, RUN).num_items == len(read_index(workspace).names)
