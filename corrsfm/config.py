@@ -137,9 +137,12 @@ class ImagesConfig:
         None, "Folder of masks named like the photos plus '.png'; zero means ignore"
     )
     camera_mode: CameraMode = option(
-        CameraMode.AUTO, "Photos that share a camera; auto groups equal size, make, model and focal length"
+        CameraMode.AUTO,
+        "Photos that share a camera; auto groups equal size, make, model and focal length, and photos without "
+        "EXIF if all of them have one size",
     )
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
+    skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
     camera_params: str = option("", "Known intrinsics as comma-separated numbers in COLMAP's order")
 
 
@@ -153,7 +156,6 @@ class FeaturesConfig:
         1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
     )
     root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
-    skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,6 +271,10 @@ def _convert(annotation: Any, value: Any) -> Any:
         return tuple(_convert(typing.get_args(annotation)[0], item) for item in items)
     if isinstance(annotation, type) and issubclass(annotation, StrEnum):
         return annotation(value)
+    if origin is typing.Literal:
+        if value not in typing.get_args(annotation):
+            raise ValueError
+        return value
     if annotation is Path:
         return Path(value)
     if annotation is float and type(value) is int:
@@ -279,6 +285,8 @@ def _convert(annotation: Any, value: Any) -> Any:
 
 
 def _expected(annotation: Any) -> str:
+    if typing.get_origin(annotation) is typing.Literal:
+        return "one of " + ", ".join(str(choice) for choice in typing.get_args(annotation))
     choices = [
         a
         for a in (annotation, *typing.get_args(annotation))
