@@ -246,8 +246,7 @@ class PointContext(nn.Module):
         self.linear2 = nn.Linear(channels, channels)
 
     def forward(self, graph: Tensor, mask: Tensor | None) -> Tensor:
-        x = F.gelu(normalise(graph, self.norm1, 1e-3, mask))
-        x = F.linear(x, self.linear1.weight)  # its bias would vanish in the normalisation that follows
+        x = self.linear1(F.gelu(normalise(graph, self.norm1, 1e-3, mask)))
         return self.linear2(F.gelu(normalise(x, self.norm2, 1e-3, mask)))
 
 
@@ -539,7 +538,7 @@ class SmallestEigenvector(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> Tensor:
         values, vectors = ctx.saved_tensors
         gap = values[..., :1] - values  # (...,n), zero or negative
-        usable = gap.abs() > 1e-7 * values[..., -1:].abs()
+        usable = gap.abs() > 100 * torch.finfo(values.dtype).eps * values[..., -1:].abs()
         along = (gradient[..., None, :] @ vectors).squeeze(-2)  # gradient in the basis of eigenvectors
         along = torch.where(usable, along / torch.where(usable, gap, 1.0), 0.0)
         outer = (vectors @ along[..., None]) * vectors[..., None, :, 0]
@@ -703,12 +702,14 @@ class PruningOutput(NamedTuple):
     step.
     """
 
-    logits: tuple[Tensor, ...]  # (B,N), ..., (B,N'), ..., (B,N'')
-    indices: tuple[
-        Tensor, ...
-    ]  # int64, like logits: which input each logit belongs to, best first after a pruning
-    essential: Tensor  # (B,3,3), unit norm, x1^T E x0 = 0; the fundamental matrix with estimate="fundamental"
-    residuals: Tensor  # (B,N), squared symmetric epipolar distance of every input to `essential`
+    logits: tuple[Tensor, ...]
+    """(B,N), ..., (B,N'), ..., (B,N'')."""
+    indices: tuple[Tensor, ...]
+    """int64, like `logits`: which input each logit belongs to; best first after a pruning."""
+    essential: Tensor
+    """(B,3,3), unit norm, x1^T E x0 = 0; the fundamental matrix with ``estimate="fundamental"``."""
+    residuals: Tensor
+    """(B,N), squared symmetric epipolar distance of every input to `essential`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -860,14 +861,14 @@ class CorrAdaptor(nn.Module):
             residuals = residuals.masked_fill(~mask, math.inf)
 
         kept_index = index.gather(1, order)
-        sets = [(x, index, mask) for x in first]
-        sets += [(x, kept_index, kept_mask) for x in second]
-        sets += [(last, kept_index.gather(1, last_order), last_mask)]
         num_inputs = correspondences.shape[1]
-        trimmed = [_trim(*one, num_inputs) for one in sets]
+        sets = [_trim(x, index, mask, num_inputs) for x in first]
+        sets += [_trim(x, kept_index, kept_mask, _most_rows(kept_mask, num_inputs)) for x in second]
+        last_index, last_width = kept_index.gather(1, last_order), _most_rows(last_mask, num_inputs)
+        sets += [_trim(last, last_index, last_mask, last_width)]
         return PruningOutput(
-            logits=tuple(logits for logits, _ in trimmed),
-            indices=tuple(indices for _, indices in trimmed),
+            logits=tuple(logits for logits, _ in sets),
+            indices=tuple(indices for _, indices in sets),
             essential=matrix,
             residuals=residuals[:, :num_inputs],
         )
@@ -912,14 +913,19 @@ class CorrAdaptor(nn.Module):
             order = logits.argsort(dim=1, descending=True, stable=True)
             return order[:, : int(logits.shape[1] * self.pruning_ratio)], None
         order = logits.masked_fill(~mask, -math.inf).argsort(dim=1, descending=True, stable=True)
-        num_kept = (mask.sum(1) * self.pruning_ratio).long().clamp(min=1)
-        width = max(int(num_kept.max()), min_rows)
-        return order[:, :width], torch.arange(width, device=order.device) < num_kept[:, None]
+        num_kept = [max(int(count * self.pruning_ratio), 1) for count in mask.sum(1).tolist()]
+        width = max([*num_kept, min_rows])
+        row = torch.arange(width, device=order.device)
+        return order[:, :width], row < torch.tensor(num_kept, device=order.device)[:, None]
 
 
-def _trim(logits: Tensor, indices: Tensor, mask: Tensor | None, num_inputs: int) -> tuple[Tensor, Tensor]:
-    """Logits and indices without the columns that hold padding in every pair of the batch."""
-    if mask is None:
-        return logits, indices
-    width = num_inputs if logits.shape[1] >= num_inputs else int(mask.sum(1).max())
-    return logits.masked_fill(~mask, -math.inf)[:, :width], indices[:, :width]
+def _most_rows(mask: Tensor | None, num_inputs: int) -> int:
+    """Columns that hold a correspondence in at least one pair, no more than there were inputs."""
+    return num_inputs if mask is None else min(int(mask.sum(1).max()), num_inputs)
+
+
+def _trim(logits: Tensor, indices: Tensor, mask: Tensor | None, width: int) -> tuple[Tensor, Tensor]:
+    """The first columns of logits and indices, with minus infinity as the logit of padding."""
+    if mask is not None:
+        logits = logits.masked_fill(~mask, -math.inf)
+    return logits[:, :width], indices[:, :width]
