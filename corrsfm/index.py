@@ -8,14 +8,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from corrsfm.cameras import PhotoInfo
 from corrsfm.errors import WorkspaceError
+from corrsfm.images import hash_file, read_photo_info
 from corrsfm.types import Camera, ImageRecord, PairList
 from corrsfm.workspace import Workspace, atomic_write_json, atomic_write_text
 
-__all__ = ["Index", "read_index", "read_pairs", "write_index", "write_pairs"]
+__all__ = ["Index", "PhotoCache", "read_index", "read_pairs", "write_index", "write_pairs"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,6 +44,48 @@ class Index:
     def camera_of(self, record: ImageRecord) -> Camera:
         """The camera that took a photo."""
         return self.cameras[record.camera_id]
+
+
+class PhotoCache:
+    """Hashes and headers of photos, remembered as long as size and modification time stay the same.
+
+    Reading them decodes every photo, which a resumed run of thousands of photos should not do again.
+
+    Parameters
+    ----------
+    path : Path
+        The file that remembers; a missing or damaged one remembers nothing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._kept: dict[str, dict[str, Any]] = {}
+        try:
+            self._known = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            self._known = {}
+
+    def hash_of(self, path: Path) -> str:
+        """As `corrsfm.images.hash_file`."""
+        return self._value(path, "sha256", hash_file)
+
+    def info_of(self, path: Path) -> PhotoInfo:
+        """As `corrsfm.images.read_photo_info`."""
+        values = self._value(path, "info", lambda photo: dataclasses.asdict(read_photo_info(photo)))
+        return PhotoInfo(**_tuples(values, "gps"))
+
+    def _value(self, path: Path, key: str, compute: Callable[[Path], Any]) -> Any:
+        name, stat = str(path), path.stat()
+        stamp = [stat.st_size, stat.st_mtime_ns]
+        known = self._known.get(name)
+        entry = self._kept.setdefault(name, known if known and known["stamp"] == stamp else {"stamp": stamp})
+        if key not in entry:
+            entry[key] = compute(path)
+        return entry[key]
+
+    def save(self) -> None:
+        """Remember the photos that were asked for since construction, and no others."""
+        atomic_write_json(self._path, self._kept)
 
 
 def write_index(workspace: Workspace, index: Index) -> None:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError, InputError, WorkspaceError
-from corrsfm.index import Index, read_index, read_pairs, write_index, write_pairs
+from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
 from corrsfm.machine import device_of, threaded, threads_of, use_threads, versions
 from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
@@ -69,7 +69,11 @@ def index_photos(
     from corrsfm.images import duplicate_images, index_images, name_remarks
 
     started = time.monotonic()
-    records, cameras = index_images(images_dir, config)
+    cache = PhotoCache(workspace.photo_cache)
+    records, cameras = index_images(
+        images_dir, config, threads=threads_of(run), hash_of=cache.hash_of, info_of=cache.info_of
+    )
+    cache.save()
     check_hloc_keys(record.name for record in records)
     for remark in name_remarks([record.name for record in records]):
         logger.warning("%s", remark)

@@ -163,6 +163,7 @@ class Workspace:
         self.manifest = root / "workspace.json"
         self.images_txt = root / "images.txt"
         self.images_json = root / "images.json"
+        self.photo_cache = root / ".photos.json"
         self.features = root / "features.h5"
         self.pairs = root / "pairs.txt"
         self.pair_origins = root / "pair_origins.tsv"

@@ -51,6 +51,8 @@ SAME_LAYER: set[tuple[str, str]] = {
     ("types", "errors"),
     ("config", "errors"),
     ("images", "cameras"),
+    ("index", "cameras"),
+    ("index", "images"),
     ("index", "workspace"),
     ("store", "workspace"),
     ("pipeline", "resume"),

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from photos import write_photo, write_photos
 
 from corrsfm import config as cfg
-from corrsfm import pipeline
+from corrsfm import images, index, pipeline
 from corrsfm.errors import ImageError, WorkspaceError
 from corrsfm.index import read_index, read_pairs
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
@@ -80,6 +81,28 @@ def test_a_second_run_keeps_everything(workspace: Workspace, photos: Path) -> No
     again = run_front(workspace, photos)
     assert all(items == kept for stage, (items, kept) in again.items() if stage != "images")
     assert before == {path.name: path.stat().st_mtime_ns for path in workspace.root.glob("*.h5")}
+
+
+def test_unchanged_photos_are_not_even_opened_again(
+    workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_front(workspace, photos)
+    opened: list[str] = []
+    for function in ("hash_file", "read_photo_info"):
+        original = getattr(images, function)
+
+        def spy(path: Path, original: Callable = original) -> object:
+            opened.append(path.name)
+            return original(path)
+
+        monkeypatch.setattr(index, function, spy)
+    write_photo(photos / "2.png", 85)
+    before = read_index(workspace)
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    assert set(opened) == {"2.png"}
+    assert [a == b for a, b in zip(before.records, read_index(workspace).records, strict=True)] == [
+        True, True, False, True,
+    ]  # fmt: skip
 
 
 def test_a_changed_photo_redoes_its_features_and_its_pairs_only(workspace: Workspace, photos: Path) -> None:
