@@ -149,7 +149,7 @@ def test_training_forward_equals_plain_reference(parity_dir, published):
     ],
 )
 def test_gradient_is_the_slope_of_the_loss(name, block):
-    """In training mode; what passes from the first block to the second is detached, so each has its own loss."""
+    """What passes from the first block to the second is detached, so each block has its own loss."""
     network = small_network(side_channels=1).double().train()
     pairs, side = two_view_pairs(2, 40).double(), torch.rand(2, 40, 1, dtype=torch.float64)
 
