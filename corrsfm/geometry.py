@@ -109,10 +109,13 @@ def pose_error_deg(
 ) -> tuple[float, float]:
     """Rotation error and direction error of the translation, in degrees.
 
-    The translation's sign is not judged, as in the literature: its error is ``min(e, 180 − e)``.
+    The translation's sign is not judged, as in the literature: its error is ``min(e, 180 − e)``. A translation
+    of no length or not finite has no direction and gets the largest error, 90.
     """
     rotation_error = rotation_angle_deg(
         np.asarray(rotation, np.float64) @ np.asarray(true_rotation, np.float64).T
     )
     direction_error = angle_between_deg(translation, true_translation)
+    if not np.linalg.norm(np.asarray(translation, np.float64)) > 0:
+        return rotation_error, 90.0
     return rotation_error, min(direction_error, 180.0 - direction_error)
