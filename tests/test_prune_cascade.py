@@ -113,6 +113,18 @@ def test_kept_matches_follow_the_estimated_precision():
         errors_px[300 : 300 + num_background] = 1.0
         return np.flatnonzero(select_explained(pair, errors_px, max_ratio=0.8, max_error_px=4.0)).tolist()
 
+    network = index < 30
+
+    def kept_with_network(num_strict, num_loose, num_background):
+        errors_px = np.full(1000, 99.0)
+        errors_px[:num_strict] = errors_px[100 : 100 + num_loose] = 1.0
+        errors_px[300 : 300 + num_background] = 1.0
+        mask = select_explained(
+            pair, errors_px, max_ratio=0.8, max_error_px=4.0, network_kept=network | (index == 100)
+        )
+        return np.flatnonzero(mask).tolist()
+
+    assert kept_with_network(60, 30, 80) == [*range(30), 100]
     assert kept(90, 80, 35) == [*range(90), *range(100, 180)]
     assert kept(60, 30, 80) == [*range(60)]
     assert kept(10, 10, 80) == []

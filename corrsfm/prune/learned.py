@@ -28,6 +28,7 @@ __all__ = [
     "choose_device",
     "choose_precision",
     "pack_batches",
+    "score_matches",
     "select_candidates",
     "select_kept",
     "sha256_of",
@@ -38,10 +39,13 @@ logger = logging.getLogger(__name__)
 # The weighted eight-point algorithm sees what two prunings leave; of fewer it makes an arbitrary matrix.
 _MIN_NUM_FOR_MATRIX = 8
 
-# Squared symmetric epipolar distances in normalised units, see `select_kept`.
-POSE_MAX_RESIDUAL = 3e-5
-SFM_MAX_RESIDUAL = 1e-4
+# Scores from which on a match is kept, see `select_kept`.
+POSE_MIN_SCORE = 0.9
+SFM_MIN_SCORE = 0.5
 SFM_MIN_KEPT = 30
+
+# Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
+MAX_RESIDUAL = 1e-4
 
 # The guard speaks only about pairs that can show what they are.
 _GUARD_MIN_MATCHES = 50
@@ -146,37 +150,59 @@ def pack_batches(sizes: Sequence[int], max_batch_matches: int) -> list[list[int]
 
 
 def select_kept(
-    pair: Correspondences,
-    scores: NDArray[np.float32],
-    residuals: NDArray[np.float32],
-    operating_point: OperatingPoint,
+    pair: Correspondences, scores: NDArray[np.float32], operating_point: OperatingPoint
 ) -> NDArray[np.bool_]:
     """The matches to keep at an operating point.
+
+    Scores decide, not the distance to the network's matrix: a robust estimator that follows makes a better
+    matrix from well-chosen matches than the weighted eight-point algorithm, and on 120 validation pairs
+    scores left more than twice as many pairs usable.
 
     Parameters
     ----------
     pair : Correspondences
     scores : (M,) float32
         Confidence of the network in each match, in [0, 1].
-    residuals : (M,) float32
-        Squared symmetric epipolar distances to the network's essential matrix, normalised units.
     operating_point : OperatingPoint
-        ``pose``: residual below 3e-5, the published threshold for two-view poses. ``sfm``: mutual matches
-        with a residual below 1e-4, and the best-scored mutual matches up to 30 kept ones, so that
-        verification has something to judge where the network's matrix is poor.
+        ``pose``: score above 0.9. ``sfm``: mutual matches with a score above 0.5, and the best of the other
+        mutual matches up to 30 kept ones, so that verification has something to judge.
 
     Returns
     -------
     (M,) bool
     """
     if operating_point is OperatingPoint.POSE:
-        return residuals < POSE_MAX_RESIDUAL
-    kept = pair.mutual & (residuals < SFM_MAX_RESIDUAL)
+        return scores > POSE_MIN_SCORE
+    kept = pair.mutual & (scores > SFM_MIN_SCORE)
     missing = SFM_MIN_KEPT - int(np.count_nonzero(kept))
     if missing > 0:
         others = np.flatnonzero(pair.mutual & ~kept & (scores > 0))
         kept[others[np.argsort(-scores[others], kind="stable")[:missing]]] = True
     return kept
+
+
+def score_matches(logits: NDArray[np.float32], residuals: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Confidence in every match, whether the network saw it or not.
+
+    Parameters
+    ----------
+    logits : (M,) float32
+        Last logit of each match; −inf for those that the network did not see.
+    residuals : (M,) float32
+        Squared distances to the network's matrix; infinite without one.
+
+    Returns
+    -------
+    (M,) float32
+        The logistic function of the logit. For an unseen match ``a · exp(−residual / 1e-4)``, where a is
+        the share of the probable matches that the matrix explains: what is known of its quality.
+    """
+    unseen = np.isneginf(logits)
+    with np.errstate(over="ignore"):  # of exp(∞), whose limit is right
+        scores = 1.0 / (1.0 + np.exp(-logits))
+    probable = scores > SFM_MIN_SCORE
+    agreement = float(np.mean(residuals[probable] < MAX_RESIDUAL)) if probable.any() else 0.0
+    return np.where(unseen, agreement * np.exp(-residuals / MAX_RESIDUAL), scores).astype(np.float32)
 
 
 class Pruner:
@@ -256,9 +282,9 @@ class Pruner:
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
 
-        Scores are the network's probabilities that a match is right, from the last round that judged it; a
-        match that the network did not see has the score 0.5 · exp(−residual / 1e-4). Pairs with fewer than
-        32 matches (for the published pruning ratio) get scores but no model.
+        Scores are the network's probabilities that a match is right, from the last round that judged it;
+        see `score_matches` for matches that it did not see. Pairs with fewer than 32 matches (for the
+        published pruning ratio) get scores but no model.
         """
         self._guard(pairs)
         candidates = [select_candidates(pair, self._max_candidates) for pair in pairs]
@@ -270,14 +296,10 @@ class Pruner:
         if estimate.essential is not None:
             model = TwoViewModel(kind="essential", matrix=estimate.essential)
             residuals = normalised_residuals(model, pair)
-        unseen = np.isneginf(estimate.logits)
-        with np.errstate(over="ignore"):  # of exp(∞) and exp(−∞), whose limits are right
-            probabilities = 1.0 / (1.0 + np.exp(-estimate.logits))
-        scores = np.where(unseen, 0.5 * np.exp(-residuals / SFM_MAX_RESIDUAL), probabilities)
-        scores = scores.astype(np.float32)
+        scores = score_matches(estimate.logits, residuals)
         return PruneResult(
             scores=scores,
-            inlier_mask=select_kept(pair, scores, residuals, self._operating_point),
+            inlier_mask=select_kept(pair, scores, self._operating_point),
             model=model,
             residuals=residuals if model is not None else np.full(len(pair), np.nan, np.float32),
             decided_by=self.name,
