@@ -28,7 +28,6 @@ mutual              (⌈M/8⌉,) uint8      mutual flags, packed bits
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +40,7 @@ from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
 from corrsfm.oanet import OANetPair, pinhole_parameters
 from corrsfm.types import Camera
+from corrsfm.workspace import atomic_path
 
 __all__ = ["NO_NEIGHBOUR", "CompactScene", "read_labelled_pairs", "read_scenes", "write_scenes"]
 
@@ -191,11 +191,8 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
     int
         The number of pairs written.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
     num_pairs = 0
-    with h5py.File(partial, "w") as file:
+    with atomic_path(Path(path)) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["format"], file.attrs["version"] = _FORMAT, _VERSION
         for scene in scenes:
             group = file.create_group(scene.name)
@@ -206,7 +203,6 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
                 compress = {"compression": "gzip", "shuffle": True} if values.size > 64 else {}
                 group.create_dataset(name, data=values, **compress)
             num_pairs += len(scene.pairs)
-    os.replace(partial, path)
     return num_pairs
 
 

@@ -11,7 +11,15 @@ from typing import Any
 from corrsfm.config import from_dict, option
 from corrsfm.errors import ConfigError
 
-__all__ = ["AugmentConfig", "PrepareConfig", "Schedule", "TrainConfig", "TrainRecipe", "load_recipe"]
+__all__ = [
+    "AugmentConfig",
+    "PrepareConfig",
+    "Schedule",
+    "SyntheticConfig",
+    "TrainConfig",
+    "TrainRecipe",
+    "load_recipe",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,3 +142,12 @@ def load_recipe(path: Path) -> TrainRecipe:
         augment=from_dict(AugmentConfig, values.get("augment", {}), f"{path}: augment"),
         network=network,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SyntheticConfig:
+    """Synthetic pairs."""
+
+    min_inlier_ratio: float = option(0.03, "Smallest share of right matches", minimum=0)
+    max_inlier_ratio: float = option(0.9, "Largest share of right matches", minimum=0)
+    noise_px: float = option(1.0, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0)

@@ -320,7 +320,7 @@ class Trainer:
             "seed": self.config.seed,
             "recipe": json.loads(json.dumps(to_dict(self.recipe), default=str)),
             "hardware": f"{self.device.type}, {platform.machine()}, {torch.get_num_threads()} threads",
-            "versions": {"corrsfm": __version__, "torch": torch.__version__, "numpy": np.__version__},
+            "versions": {"corrsfm": __version__, "torch": str(torch.__version__), "numpy": np.__version__},
         }
 
     def _write_recipe(self) -> None:

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 
-import cv2  # before pycolmap
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -23,6 +22,7 @@ from corrsfm.cameras import camera_from_pycolmap, normalise_points
 from corrsfm.compact import NO_NEIGHBOUR, CompactScene, write_scenes
 from corrsfm.errors import ImageError, InputError
 from corrsfm.features import extract_features
+from corrsfm.images import read_image
 from corrsfm.matches import match_features
 from corrsfm.oanet import pinhole_parameters
 from corrsfm.training.config import PrepareConfig
@@ -172,17 +172,13 @@ def _offsets(parts: list) -> NDArray[np.int64]:
 
 
 def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise ImageError(f"{path}: cannot be read as a photo")
+    image = read_image(path)
     if image.shape != (camera.height, camera.width):
         raise ImageError(
             f"{path}: is {image.shape[1]} × {image.shape[0]} pixels, "
             f"its camera says {camera.width} × {camera.height}"
         )
-    return extract_features(
-        image.astype(np.uint8), max_features=config.max_features, max_image_size=config.max_image_size
-    )
+    return extract_features(image, max_features=config.max_features, max_image_size=config.max_image_size)
 
 
 def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,0 +1,113 @@
+"""Batches: augmentation keeps the truth true and the side information consistent."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from labelled_scene import make_scene
+
+from corrsfm.prune.correspondences import side_information
+from corrsfm.training.config import AugmentConfig
+from corrsfm.training.dataset import RealPairs, augment, generator_for, side_channels
+
+CPU = torch.device("cpu")
+NOTHING = AugmentConfig(**{f.name: 0.0 for f in dataclasses.fields(AugmentConfig) if "probability" in f.name})
+
+
+@pytest.fixture(scope="module")
+def data() -> RealPairs:
+    return RealPairs([make_scene("a"), make_scene("b", seed=1)], CPU)
+
+
+def test_labels_agree_with_the_compact_file(data):
+    scene = make_scene("a")
+    expected = [(scene.pair(index).label_distances < 1e-4).mean() for index in range(6)]
+    np.testing.assert_allclose(data.inlier_ratios[:6].numpy(), expected, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    ["swap_probability", "mirror_probability", "quarter_turn_probability", "turn_probability",
+     "undistort_probability", "jitter_probability", "unknown_focal_probability"],
+)  # fmt: skip
+def test_augmentation_keeps_labels(data, changed):
+    generator = generator_for(0, 0, 0, CPU)
+    batch = data.sample(8, 40, NOTHING, generator)
+    config = dataclasses.replace(NOTHING, **{changed: 1.0})
+    changed_batch = augment(batch, torch.full((8, 2), 0.8), config, generator_for(1, 0, 0, CPU))
+    right = batch.distances() < 1e-6
+    assert right.float().mean() > 0.3
+    assert float(changed_batch.distances()[right].max()) < 1e-5
+    if changed != "undistort_probability":
+        assert not torch.allclose(changed_batch.true_correspondences, batch.true_correspondences)
+
+
+def test_swap_exchanges_points_and_inverts_side_information(data):
+    batch = data.sample(4, 40, NOTHING, generator_for(0, 0, 0, CPU))
+    swapped = augment(
+        batch,
+        torch.ones(4, 2),
+        dataclasses.replace(NOTHING, swap_probability=1.0),
+        generator_for(1, 0, 0, CPU),
+    )
+    torch.testing.assert_close(swapped.correspondences, batch.correspondences[..., [2, 3, 0, 1]])
+    torch.testing.assert_close(swapped.log_scale_ratios, -batch.log_scale_ratios)
+    torch.testing.assert_close(swapped.rotations, -batch.rotations)
+    torch.testing.assert_close(swapped.matrix, batch.matrix.transpose(1, 2))
+
+
+def test_turning_one_photo_turns_its_keypoints(data):
+    batch = data.sample(4, 40, NOTHING, generator_for(0, 0, 0, CPU))
+    config = dataclasses.replace(NOTHING, turn_probability=1.0, max_turn_deg=20.0)
+    turned = augment(batch, torch.ones(4, 2), config, generator_for(1, 0, 0, CPU))
+
+    def angle(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+        cosine = (before * after).sum(-1)
+        sine = before[..., 0] * after[..., 1] - before[..., 1] * after[..., 0]
+        return torch.atan2(sine, cosine)
+
+    turns = [
+        angle(batch.correspondences[..., c : c + 2], turned.correspondences[..., c : c + 2]) for c in (0, 2)
+    ]
+    torch.testing.assert_close(turned.rotations - batch.rotations, turns[1] - turns[0], atol=1e-4, rtol=0)
+
+
+def test_thinning_lowers_the_share_of_right_matches(data):
+    config = dataclasses.replace(NOTHING, thin_probability=1.0)
+    plain, thinned = (
+        torch.stack(
+            [
+                (data.sample(16, 30, c, generator_for(0, s, 0, CPU)).distances() < 1e-6).float().mean()
+                for s in range(8)
+            ]
+        ).mean()
+        for c in (NOTHING, config)
+    )
+    assert float(thinned) < 0.8 * float(plain)
+
+
+def test_short_pairs_are_padded_and_masked(data):
+    batch = data.sample(4, 100, NOTHING, generator_for(0, 0, 0, CPU))
+    assert batch.mask.sum(1).tolist() == [59] * 4 or batch.correspondences.shape[1] == 60
+
+
+def test_side_channels_are_those_of_inference():
+    scene = make_scene("a")
+    data = RealPairs([scene], CPU)
+    batch = data._gather(torch.tensor([0]), torch.arange(59)[None])
+    expected = side_information(scene.pair(0).as_correspondences(), 5)
+    channels = side_channels(batch, 5)
+    assert channels is not None
+    np.testing.assert_allclose(channels[0].numpy(), expected, atol=3e-3)
+    assert side_channels(batch, 0) is None
+
+
+def test_batches_depend_on_seed_step_and_rank_only(data):
+    config = AugmentConfig()
+    first, again = (data.sample(4, 32, config, generator_for(3, 7, 1, CPU)) for _ in range(2))
+    assert torch.equal(first.correspondences, again.correspondences)
+    for other in [(4, 7, 1), (3, 8, 1), (3, 7, 0)]:
+        assert not torch.equal(
+            first.correspondences, data.sample(4, 32, config, generator_for(*other, CPU)).correspondences
+        )
