@@ -42,7 +42,7 @@ from corrsfm.oanet import OANetPair, pinhole_parameters
 from corrsfm.types import Camera
 from corrsfm.workspace import atomic_path
 
-__all__ = ["NO_NEIGHBOUR", "CompactScene", "read_labelled_pairs", "read_scenes", "write_scenes"]
+__all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
 
 NO_NEIGHBOUR = 65535
 _FORMAT, _VERSION = "corrsfm-pairs", 1
@@ -242,6 +242,15 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
         ratios=(stored["ratios"] / 255.0).astype(np.float32),
         mutual=np.unpackbits(stored["mutual"], count=num_matches).astype(bool),
     )
+
+
+def is_compact(path: Path) -> bool:
+    """Whether a file is a compact pair file of any version, rather than one in another HDF5 layout."""
+    try:
+        with h5py.File(path, "r") as file:
+            return bool(file.attrs.get("format") == _FORMAT)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as HDF5 ({error})") from error
 
 
 def read_scenes(path: Path) -> list[CompactScene]:

@@ -22,6 +22,7 @@ __all__ = [
     "json_option",
     "overwrite_option",
     "pipeline_options",
+    "recipe_options",
     "run_options",
 ]
 
@@ -48,7 +49,8 @@ def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
             defaults = typing.cast(tuple[StrEnum, ...], entry.default)
             settings |= {"multiple": True, "default": [str(member) for member in defaults]}
     elif inner is Path:
-        settings |= {"type": click.Path(path_type=Path), "show_default": False}
+        several = typing.get_origin(annotation) is tuple
+        settings |= {"type": click.Path(path_type=Path), "show_default": False, "multiple": several}
     elif inner in (int, float):
         settings["type"] = inner
     else:
@@ -123,6 +125,28 @@ def _override(base: Any, values: dict[str, Any]) -> Any:
             given[entry.name] = value
     checked = cfg.from_dict(type(base), given, "command line")
     return dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
+
+
+def recipe_options(command: F) -> F:
+    """``--config FILE`` and a flag for every option of a training run.
+
+    The command is called with ``recipe=TrainRecipe(...)``: the file's values, overridden by the flags that
+    the user really typed.
+    """
+    from corrsfm.training.config import TrainConfig, TrainRecipe, load_recipe
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, config: Path | None, **kwargs: Any) -> Any:
+        base = load_recipe(config) if config else TrainRecipe()
+        recipe = dataclasses.replace(base, train=_override(base.train, kwargs))
+        return command(*args, recipe=recipe, **kwargs)
+
+    file_option = click.option(
+        "--config",
+        type=click.Path(path_type=Path),
+        help="Recipe in TOML (tables train, augment, synthetic, network); flags typed here override it.",
+    )
+    return typing.cast(F, file_option(_with_flags(wrapped, [TrainConfig])))
 
 
 def run_options(command: F) -> F:

@@ -107,15 +107,26 @@ class TrainConfig:
         5.0, "Time between checkpoints", unit="min", minimum=0, affects_result=False
     )
     log_every: int = option(50, "Steps between lines of the log", minimum=1, affects_result=False)
+    tensorboard: bool = option(False, "Also log to TensorBoard, in the run's folder", affects_result=False)
     seed: int = option(0, "Seed of weights, batches and augmentation", minimum=0)
 
 
 @dataclass(frozen=True, kw_only=True)
+class SyntheticConfig:
+    """Synthetic pairs."""
+
+    min_inlier_ratio: float = option(0.03, "Smallest share of right matches", minimum=0)
+    max_inlier_ratio: float = option(0.9, "Largest share of right matches", minimum=0)
+    noise_px: float = option(0.5, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class TrainRecipe:
-    """A recipe file: tables ``train``, ``augment`` and ``network`` (the fields of `NetworkConfig`)."""
+    """A recipe file: tables ``train``, ``augment``, ``synthetic`` and ``network`` (as `NetworkConfig`)."""
 
     train: TrainConfig = field(default_factory=TrainConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
+    synthetic: SyntheticConfig = field(default_factory=SyntheticConfig)
     network: dict[str, Any] = field(default_factory=dict)
 
 
@@ -132,22 +143,15 @@ def load_recipe(path: Path) -> TrainRecipe:
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read as a training recipe in TOML ({error})") from error
     network = values.pop("network", {})
-    unknown = set(values) - {"train", "augment"}
+    unknown = set(values) - {"train", "augment", "synthetic"}
     if unknown:
         raise ConfigError(
-            f"{path}: unknown tables {', '.join(sorted(unknown))}; valid are train, augment, network"
+            f"{path}: unknown tables {', '.join(sorted(unknown))}; "
+            "valid are train, augment, synthetic, network"
         )
     return TrainRecipe(
         train=from_dict(TrainConfig, values.get("train", {}), f"{path}: train"),
         augment=from_dict(AugmentConfig, values.get("augment", {}), f"{path}: augment"),
+        synthetic=from_dict(SyntheticConfig, values.get("synthetic", {}), f"{path}: synthetic"),
         network=network,
     )
-
-
-@dataclass(frozen=True, kw_only=True)
-class SyntheticConfig:
-    """Synthetic pairs."""
-
-    min_inlier_ratio: float = option(0.03, "Smallest share of right matches", minimum=0)
-    max_inlier_ratio: float = option(0.9, "Largest share of right matches", minimum=0)
-    noise_px: float = option(1.0, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0)

@@ -8,21 +8,21 @@ the step and the rank: a resumed run sees the very batches that a straight run w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from corrsfm.compact import CompactScene, read_scenes
+from corrsfm.compact import CompactScene, is_compact, read_scenes
 from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, relative_pose
-from corrsfm.oanet import pinhole_parameters
+from corrsfm.oanet import OANetPair, pinhole_parameters, read_pairs
 from corrsfm.training.config import AugmentConfig
 from corrsfm.training.losses import THRESHOLD, epipolar_distance_sq
 
-__all__ = ["Batch", "RealPairs", "augment", "generator_for", "side_channels"]
+__all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_channels"]
 
 # A pair with fewer right matches has no label worth learning from.
 _MIN_INLIERS = 20
@@ -63,6 +63,14 @@ class Batch:
         return len(self.matrix)
 
 
+def concatenate(batches: Sequence[Batch]) -> Batch:
+    """One batch of several that have the same number of matches."""
+    if len(batches) == 1:
+        return batches[0]
+    columns = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in _BATCH_FIELDS}
+    return Batch(**columns)
+
+
 def side_channels(batch: Batch, num_channels: int) -> Tensor | None:
     """Side information (B, N, S) as `corrsfm.prune.side_information` lays it out, or None for no channels."""
     if num_channels == 0:
@@ -77,6 +85,9 @@ def side_channels(batch: Batch, num_channels: int) -> Tensor | None:
     return torch.stack(channels[:num_channels], dim=-1)
 
 
+_BATCH_FIELDS = tuple(entry.name for entry in fields(Batch))
+
+
 def generator_for(seed: int, step: int, rank: int, device: torch.device, stream: int = 0) -> torch.Generator:
     """The random generator of one step of one process; ``stream`` separates its uses."""
     words = np.random.SeedSequence([seed, step, rank, stream]).generate_state(2, np.uint32)
@@ -88,7 +99,8 @@ class RealPairs:
 
     Parameters
     ----------
-    scenes : sequence of CompactScene
+    scenes : sequence of CompactScene or OANetPair
+        Scenes of compact files, or pairs of files in OANet's layout, one after the other.
     device : torch.device
     scene_power : float
         A scene is drawn in proportion to its number of pairs to this power: 0 treats scenes alike, 1 treats
@@ -101,19 +113,23 @@ class RealPairs:
     """
 
     def __init__(
-        self, scenes: Sequence[CompactScene], device: torch.device, scene_power: float = 0.5
+        self, scenes: Sequence[CompactScene | OANetPair], device: torch.device, scene_power: float = 0.5
     ) -> None:
         self.device = device
-        self.scene_names = [scene.name for scene in scenes]
+        names = [scene.name if isinstance(scene, CompactScene) else scene.scene for scene in scenes]
+        self.scene_names = list(dict.fromkeys(names))
+        number = {name: index for index, name in enumerate(self.scene_names)}
         parts: dict[str, list[np.ndarray]] = {}
         num_keys = num_matches = 0
-        for number, scene in enumerate(scenes):
-            arrays, matrices = _flatten(scene, num_keys, num_matches)
-            arrays["scene"] = np.full(len(scene.pairs), number)
-            arrays["matrix"] = matrices
-            for name, values in arrays.items():
-                parts.setdefault(name, []).append(values)
-            num_keys += len(scene.keypoints)
+        for name, scene in zip(names, scenes, strict=True):
+            if isinstance(scene, CompactScene):
+                arrays = _flatten_scene(scene, num_keys, num_matches)
+            else:
+                arrays = _flatten_pair(scene, num_keys, num_matches)
+            arrays["scene"] = np.full(len(arrays["matrix"]), number[name])
+            for key, values in arrays.items():
+                parts.setdefault(key, []).append(values)
+            num_keys += len(arrays["points"])
             num_matches += len(arrays["key1"])
         if not parts:
             raise InputError("no scene to train on")
@@ -126,8 +142,11 @@ class RealPairs:
 
     @classmethod
     def from_files(cls, paths: Sequence[Path], device: torch.device, scene_power: float = 0.5) -> RealPairs:
-        """Read compact files; see the class."""
-        return cls([scene for path in paths for scene in read_scenes(path)], device, scene_power)
+        """Read compact files and files in OANet's layout; see the class."""
+        scenes: list[CompactScene | OANetPair] = []
+        for path in paths:
+            scenes.extend(read_scenes(path) if is_compact(path) else read_pairs(path))
+        return cls(scenes, device, scene_power)
 
     def _count_inliers(self) -> tuple[Tensor, Tensor]:
         ratios, counts = [], []
@@ -199,9 +218,30 @@ class RealPairs:
         return augment(batch, guess, config, generator)
 
 
-def _flatten(
-    scene: CompactScene, first_key: int, first_match: int
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str, np.ndarray]:
+    """Arrays of a pair in OANet's layout, which has its own keypoints: those of image 0, then of image 1."""
+    num = len(pair)
+    zeros = np.zeros(num, np.float32)
+    # YFCC100M has more keypoints than 32 bits can count.
+    dtype = np.int32 if first_key + 2 * num < 2**31 else np.int64
+    rows = first_key + np.arange(num)
+    return {
+        "points": pair.correspondences.reshape(num, 2, 2).transpose(1, 0, 2).reshape(-1, 2),
+        "corrections": np.zeros((2 * num, 2), np.float32),
+        "log_scales": np.concatenate([zeros, pair.log_scale_ratios]).astype(np.float16),
+        "orientations": np.concatenate([zeros, pair.rotations]),
+        "key0": rows.astype(dtype),
+        "key1": (rows + num).astype(dtype),
+        "ratios": np.round(np.clip(pair.ratios, 0, 1) * 255.0).astype(np.uint8),
+        "mutual": pair.mutual,
+        "num_matches": np.array([num]),
+        "match_start": np.array([first_match]),
+        "guess": np.ones((1, 2), np.float32),
+        "matrix": essential_from_pose(pair.rotation, pair.translation)[None].astype(np.float32),
+    }
+
+
+def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dict[str, np.ndarray]:
     """Arrays of a scene with indices into the concatenation of all scenes."""
     images = range(len(scene.image_names))
     points = [scene.normalised(image, undistorted=False) for image in images]
@@ -228,7 +268,7 @@ def _flatten(
         )
         matrices.append(essential_from_pose(*pose))
         guesses.append([_guess_factor(scene, int(image)) for image in (image0, image1)])
-    arrays = {
+    return {
         "points": np.concatenate(points).astype(np.float32),
         "corrections": scene.corrections,
         "log_scales": scene.log_scales.astype(np.float16),
@@ -240,8 +280,8 @@ def _flatten(
         "num_matches": counts,
         "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
         "guess": np.array(guesses, np.float32),
+        "matrix": np.array(matrices, np.float32),
     }
-    return arrays, np.array(matrices, np.float32)
 
 
 def _guess_factor(scene: CompactScene, image: int) -> float:

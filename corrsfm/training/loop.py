@@ -27,15 +27,16 @@ from torch import Tensor, nn
 
 from corrsfm import __version__
 from corrsfm.config import from_dict, to_dict
-from corrsfm.errors import ConfigError
+from corrsfm.errors import ConfigError, DependencyError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.training.checkpoint import Average, load_state, save_state
 from corrsfm.training.config import Schedule, TrainRecipe
-from corrsfm.training.dataset import Batch, RealPairs, generator_for, side_channels
+from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_channels
 from corrsfm.training.losses import classification_loss, essential_loss, virtual_points
+from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
 
-__all__ = ["Trainer", "learning_rate_factor", "train"]
+__all__ = ["Trainer", "learning_rate_factor", "network_config", "train"]
 
 logger = logging.getLogger(__name__)
 
@@ -92,6 +93,11 @@ def train(
         return trainer.run()
 
 
+def network_config(recipe: TrainRecipe) -> NetworkConfig:
+    """The architecture that a recipe asks for."""
+    return from_dict(NetworkConfig, recipe.network, "network")
+
+
 @contextmanager
 def _process_group(device: torch.device) -> Iterator[tuple[int, torch.device]]:
     """Rank and device of this process; joins the processes that ``torchrun`` started."""
@@ -134,8 +140,8 @@ class Trainer:
         self.recipe, self.config, self.data, self.device, self.rank = recipe, recipe.train, data, device, rank
         self._on_log = on_log
         torch.manual_seed(self.config.seed)
-        network_config = from_dict(NetworkConfig, recipe.network, "network")
-        self.network = CorrAdaptor.from_config(network_config).to(device)
+        self.network = CorrAdaptor.from_config(network_config(recipe)).to(device)
+        self._synthetic = SyntheticPairs(recipe.synthetic, device)
         self.average = Average(self.network, self.config.ema_decay)
         self.optimiser = torch.optim.AdamW(
             _parameter_groups(self.network, self.config.weight_decay), lr=self.config.learning_rate
@@ -148,6 +154,7 @@ class Trainer:
         self.step = self.num_skipped = 0
         self.minutes = 0.0
         self._validation: Validation | None = None
+        self._writer: Any = None
         self.config.output.mkdir(parents=True, exist_ok=True)
         self.state_path = self.config.output / "state.pt"
 
@@ -215,8 +222,17 @@ class Trainer:
     def draw(self, step: int) -> Batch:
         """The batch of a step, a function of seed, step and rank only."""
         config = self.config
-        generator = generator_for(config.seed, step, self.rank, self.device)
-        return self.data.sample(config.batch_size, config.num_matches, self.recipe.augment, generator)
+        num_synthetic = round(config.synthetic_share * config.batch_size)
+        num_real = config.batch_size - num_synthetic
+        parts = []
+        if num_real > 0:
+            generator = generator_for(config.seed, step, self.rank, self.device)
+            parts.append(self.data.sample(num_real, config.num_matches, self.recipe.augment, generator))
+        if num_synthetic > 0:
+            generator = generator_for(config.seed, step, self.rank, self.device, stream=1)
+            num_matches = parts[0].mask.shape[1] if parts else config.num_matches
+            parts.append(self._synthetic.sample(num_synthetic, num_matches, generator))
+        return concatenate(parts)
 
     def loss(self, batch: Batch, *, with_essential: bool) -> tuple[Tensor, dict[str, float]]:
         """The hybrid loss of a batch and its parts."""
@@ -279,7 +295,7 @@ class Trainer:
         }
         row["baseline_auc5"] = round(self._validation.baseline["auc5"], 3)
         row |= {f"auc5_{scene}": round(value, 3) for scene, value in result["by_scene"].items()}
-        _append_csv(self.config.output / "validation.csv", row)
+        self._write_row("validation.csv", row)
         if self._on_log:
             self._on_log(row)
         return result
@@ -307,9 +323,24 @@ class Trainer:
             for name in ("loss", "classification", "essential", "gradient")
         }
         row["skipped"] = self.num_skipped
-        _append_csv(self.config.output / "log.csv", row)
+        self._write_row("log.csv", row)
         if self._on_log:
             self._on_log(row)
+
+    def _write_row(self, name: str, row: dict[str, Any]) -> None:
+        """Append to a CSV file, and to TensorBoard if wanted."""
+        _append_csv(self.config.output / name, row)
+        if not self.config.tensorboard:
+            return
+        if self._writer is None:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError as error:
+                raise DependencyError("tensorboard", "--tensorboard", "train") from error
+            self._writer = SummaryWriter(str(self.config.output))
+        for key, value in row.items():
+            if key != "step" and math.isfinite(value):
+                self._writer.add_scalar(f"{Path(name).stem}/{key}", value, row["step"])
 
     def _provenance(self) -> dict[str, Any]:
         return {

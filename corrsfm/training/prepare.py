@@ -24,11 +24,18 @@ from corrsfm.errors import ImageError, InputError
 from corrsfm.features import extract_features
 from corrsfm.images import read_image
 from corrsfm.matches import match_features
-from corrsfm.oanet import pinhole_parameters
+from corrsfm.oanet import pinhole_parameters, write_pairs
 from corrsfm.training.config import PrepareConfig
 from corrsfm.types import Camera, Features
 
-__all__ = ["choose_pairs", "prepare_file", "prepare_scene", "read_splits"]
+__all__ = [
+    "choose_pairs",
+    "prepare_file",
+    "prepare_oanet",
+    "prepare_scene",
+    "read_splits",
+    "scenes_of_split",
+]
 
 # Fewer matches than this determine no essential matrix and teach nothing.
 _MIN_KEYPOINTS = 20
@@ -96,18 +103,43 @@ def choose_pairs(covisible: dict[tuple[int, int], int], max_pairs: int, seed: in
     return sorted(set(chosen))
 
 
-def prepare_file(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> Iterator[tuple[str, int]]:
-    """Prepare scenes into one compact file; yields each scene's name and number of pairs as it is done."""
+def scenes_of_split(folder: Path, splits: Path, split: str) -> list[Path]:
+    """Folders of the scenes of one split.
+
+    Raises
+    ------
+    InputError
+        If there is no such split.
+    """
+    names = read_splits(splits)
+    if split not in names:
+        raise InputError(f"{splits}: has no split '{split}', only {', '.join(names)}")
+    return [Path(folder) / name for name in names[split]]
+
+
+def prepare_file(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> list[tuple[str, int]]:
+    """Prepare scenes into one compact file; returns each scene's name and number of pairs."""
     done: list[tuple[str, int]] = []
+    write_scenes(output, _prepared(scenes, config, done))
+    return done
 
-    def prepared() -> Iterator[CompactScene]:
-        for folder in scenes:
-            scene = prepare_scene(folder, config)
-            done.append((scene.name, len(scene.pairs)))
-            yield scene
 
-    write_scenes(output, prepared())
-    yield from done
+def prepare_oanet(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> list[tuple[str, int]]:
+    """Prepare scenes into one file in OANet's layout; returns each scene's name and number of pairs."""
+    done: list[tuple[str, int]] = []
+    prepared = _prepared(scenes, config, done)
+    write_pairs(output, (scene.pair(index) for scene in prepared for index in range(len(scene.pairs))))
+    return done
+
+
+def _prepared(
+    scenes: Iterable[Path], config: PrepareConfig, done: list[tuple[str, int]]
+) -> Iterator[CompactScene]:
+    """Scenes one by one, each noted in ``done``."""
+    for folder in scenes:
+        scene = prepare_scene(folder, config)
+        done.append((scene.name, len(scene.pairs)))
+        yield scene
 
 
 def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:

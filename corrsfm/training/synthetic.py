@@ -8,17 +8,19 @@ matcher could have mistaken for theirs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from corrsfm.training.config import SyntheticConfig
-from corrsfm.training.dataset import Batch
+from corrsfm.training.config import AugmentConfig, SyntheticConfig
+from corrsfm.training.dataset import Batch, RealPairs, generator_for
 from corrsfm.training.statistics import MEASURED, SideStatistics
 
-__all__ = ["SyntheticPairs", "make_pairs"]
+__all__ = ["SyntheticPairs", "draw_both", "make_pairs"]
 
 SCENES = ("plane", "boxes", "relief", "clutter")
 MOTIONS = ("sideways", "forward", "orbit", "near-rotation", "wide")
@@ -65,6 +67,23 @@ class SyntheticPairs:
     def sample(self, num_pairs: int, num_matches: int, generator: torch.Generator) -> Batch:
         """Draw ``num_pairs`` pairs of ``num_matches`` correspondences."""
         return make_pairs(num_pairs, num_matches, self._config, self._statistics, self._device, generator)
+
+
+def draw_both(
+    paths: Sequence[Path], num_batches: int, *, num_pairs: int = 32, num_matches: int = 1000, seed: int = 0
+) -> tuple[list[Batch], list[Batch]]:
+    """Batches of real pairs, not augmented, and as many of synthetic ones, to compare them."""
+    device = torch.device("cpu")
+    real = RealPairs.from_files(paths, device)
+    synthetic = SyntheticPairs(SyntheticConfig(), device)
+    as_they_are = AugmentConfig(
+        **{entry.name: 0.0 for entry in fields(AugmentConfig) if entry.name.endswith("probability")}
+    )
+    generators = [generator_for(seed, step, 0, device) for step in range(num_batches)]
+    return (
+        [real.sample(num_pairs, num_matches, as_they_are, generator) for generator in generators],
+        [synthetic.sample(num_pairs, num_matches, generator) for generator in generators],
+    )
 
 
 def make_pairs(
@@ -171,7 +190,7 @@ def _motions(draw: _Draw, distance: Tensor) -> tuple[Tensor, Tensor]:
     kind = draw.choice(len(MOTIONS))[:, None]
     side = F.normalize(F.pad(draw.normal(2), (0, 1)), dim=-1)
     ahead = F.pad(torch.where(draw.uniform(1) < 0.5, -1.0, 1.0), (2, 0))
-    small_turn = torch.deg2rad(4.0 * draw.normal(3))
+    small_turn = torch.deg2rad(2.0 * draw.normal(3))
     # Sideways and forward: the camera moves by a share of the distance and hardly turns.
     step = draw.uniform(1, low=0.05, high=0.5)
     sideways = step * (side + 0.1 * draw.normal(3))
@@ -182,7 +201,7 @@ def _motions(draw: _Draw, distance: Tensor) -> tuple[Tensor, Tensor]:
     orbit_turn = torch.deg2rad(angle) * axis
     roll = F.pad(torch.deg2rad(torch.where(draw.uniform(1) < 0.1, 90.0, 5.0) * draw.normal(1)), (2, 0))
     about_point = (kind == 2) | (kind == 4)
-    turn = torch.where(about_point, orbit_turn, small_turn * torch.where(kind == 3, 4.0, 1.0))
+    turn = torch.where(about_point, orbit_turn, small_turn * torch.where(kind == 3, 8.0, 1.0))
     rotation = torch.matrix_exp(_cross(turn)) @ torch.matrix_exp(_cross(roll))
     centre = F.pad(torch.ones_like(distance)[:, None], (2, 0)) * distance[:, None]
     orbit = centre - (rotation @ centre[..., None])[..., 0] + 0.05 * distance[:, None] * draw.normal(3)
@@ -206,7 +225,8 @@ def _wrong_places(draw: _Draw, x1: Tensor, half: Tensor) -> Tensor:
     few = draw.choice(max(num // 20, 1), num)[..., None].expand(-1, -1, 2)
     shared = uniform.gather(1, few)
     places = torch.stack([uniform, clustered, repeated, shared], 2)
-    weights = draw.uniform(1, 4) ** 2
+    # On real pairs a third of all matches shares its place with another one.
+    weights = draw.uniform(1, 4) ** 2 + torch.tensor([0.0, 0.0, 0.0, 0.7], device=x1.device)
     kind = torch.multinomial(weights[:, 0] + 1e-3, num, replacement=True, generator=draw.generator)  # (B, N)
     chosen = places.gather(2, kind[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]
     inside = (chosen.abs() <= half[:, None]).all(-1, keepdim=True) & chosen.isfinite().all(-1, keepdim=True)

@@ -1,0 +1,120 @@
+"""Commands that train the network: pairs from photos, the run, the checkpoint, pictures of all of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from corrsfm.cli.options import config_options, recipe_options
+from corrsfm.training.config import PrepareConfig
+
+if TYPE_CHECKING:
+    from corrsfm.training.config import TrainRecipe
+
+__all__ = ["train"]
+
+PATH = click.Path(path_type=Path)
+_NUM_COMPARED_BATCHES = 8
+
+
+@click.group()
+def train() -> None:
+    """Train the pruning network."""
+
+
+@train.command()
+@click.argument("scenes", nargs=-1, required=True, type=PATH)
+@click.option("--output", required=True, type=PATH, help="File of labelled pairs to write.")
+@click.option(
+    "--splits", type=PATH, help="JSON with scene names by split; SCENES is then the folder that holds them."
+)
+@click.option("--split", default="train", show_default=True, help="Which split of --splits.")
+@click.option(
+    "--layout",
+    type=click.Choice(["compact", "oanet"]),
+    default="compact",
+    show_default=True,
+    help="compact keeps keypoints once per photo; oanet is what the published training codes read.",
+)
+@config_options(prepare_config=PrepareConfig)
+def prepare(
+    scenes: tuple[Path, ...],
+    output: Path,
+    splits: Path | None,
+    split: str,
+    layout: str,
+    prepare_config: PrepareConfig,
+) -> None:
+    """Turn photo scenes with cameras into labelled pairs.
+
+    Each of SCENES is a folder with images/ and a COLMAP model (beside it, in sparse/0 or in model).
+    """
+    from corrsfm.training.prepare import prepare_file, prepare_oanet, scenes_of_split
+
+    folders = scenes_of_split(scenes[0], splits, split) if splits else list(scenes)
+    write = prepare_oanet if layout == "oanet" else prepare_file
+    for name, num_pairs in write(output, folders, prepare_config):
+        click.echo(f"{name}\t{num_pairs}")
+
+
+@train.command()
+@recipe_options
+@click.option("--resume", is_flag=True, help="Continue the run in the output folder, if there is one.")
+@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
+@click.option("--threads", default=0, show_default=True, help="Threads to use; 0 for all cores.")
+def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
+    """Train by a recipe, alone or on several GPUs under torchrun."""
+    import torch
+
+    from corrsfm.config import RunConfig
+    from corrsfm.machine import device_of, use_threads
+    from corrsfm.training.loop import train as train_by_recipe
+
+    options = RunConfig(device=device, threads=threads)
+    use_threads(options)
+    path = train_by_recipe(recipe, device=torch.device(device_of(options)), resume=resume, on_log=_echo_row)
+    click.echo(str(path))
+
+
+def _echo_row(row: dict[str, Any]) -> None:
+    values = (
+        f"{name} {value:.5g}" if isinstance(value, float) else f"{name} {value}"
+        for name, value in row.items()
+    )
+    click.echo("  ".join(values), err=True)
+
+
+@train.command()
+@click.argument("run_folder", metavar="RUN", type=PATH)
+@click.argument("output", type=PATH)
+@click.option("--half/--no-half", default=True, show_default=True, help="Store in half precision.")
+def export(run_folder: Path, output: Path, half: bool) -> None:
+    """Write the averaged weights of RUN as a checkpoint for `corrsfm prune`."""
+    from corrsfm.model import load_network, read_provenance, save_network
+
+    source = run_folder / "latest.pt"
+    digest = save_network(load_network(source), output, provenance=read_provenance(source), half=half)
+    click.echo(f"{output}  sha256 {digest}")
+
+
+@train.command()
+@click.option("--run", "run_folder", type=PATH, help="Run folder, for its learning curves.")
+@click.option(
+    "--pairs", "pair_files", multiple=True, type=PATH, help="Pair files to compare with synthetic pairs."
+)
+@click.option("--output", required=True, type=PATH, help="PNG to write.")
+def plots(run_folder: Path | None, pair_files: tuple[Path, ...], output: Path) -> None:
+    """Draw the learning curves of a run, or a page that compares real and synthetic pairs."""
+    if (run_folder is None) == (not pair_files):
+        raise click.UsageError("give either --run or --pairs")
+    from corrsfm.training import plots as pictures
+
+    if run_folder is not None:
+        pictures.plot_learning_curves(run_folder, output)
+    else:
+        from corrsfm.training.synthetic import draw_both
+
+        pictures.plot_distributions(*draw_both(pair_files, _NUM_COMPARED_BATCHES), output)
+    click.echo(str(output))

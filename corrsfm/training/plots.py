@@ -1,0 +1,134 @@
+"""Pictures of training: learning curves of a run, and real beside synthetic pairs."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.errors import DependencyError, InputError
+from corrsfm.training.dataset import Batch
+from corrsfm.training.losses import THRESHOLD
+
+__all__ = ["plot_distributions", "plot_learning_curves"]
+
+_SMOOTHING = 9
+_COLOURS = {"real": "#20639b", "synthetic": "#ed553b"}
+
+
+def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, NDArray]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise DependencyError("matplotlib", "plots of training", "train") from error
+    # A figure of its own, not pyplot's: no window system, nothing global.
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, np.atleast_1d(figure.subplots(rows, columns)).reshape(-1)
+
+
+def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); expected the log of a training run"
+        ) from error
+    if not rows:
+        return {}
+    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+
+
+def plot_learning_curves(run_folder: Path, output: Path) -> None:
+    """Draw losses, learning rate and validation scores of a run into a PNG."""
+    log = _read_columns(Path(run_folder) / "log.csv")
+    validation_path = Path(run_folder) / "validation.csv"
+    validation = _read_columns(validation_path) if validation_path.exists() else {}
+    if not log:
+        raise InputError(f"{run_folder}: its log is empty; train for longer")
+    figure, axes = _figure(1, 4, 17, 3.6)
+    for axis, name, title in zip(
+        axes, ("classification", "essential", "learning_rate"),
+        ("classification loss", "essential loss", "learning rate"), strict=False,
+    ):  # fmt: skip
+        values = log[name]
+        axis.plot(log["step"], values, color="#bbbbbb", linewidth=0.8)
+        if name != "learning_rate" and len(values) > 2 * _SMOOTHING:
+            smooth = np.convolve(values, np.ones(_SMOOTHING) / _SMOOTHING, mode="valid")
+            half = _SMOOTHING // 2
+            axis.plot(log["step"][half:-half], smooth, color=_COLOURS["real"])
+        axis.set(title=title, xlabel="step")
+    for name, style in (("auc5", "o-"), ("auc10", "s-"), ("auc20", "^-")):
+        if validation:
+            axes[3].plot(validation["step"], validation[name], style, label=name.replace("auc", "AUC@"))
+    if validation:
+        axes[3].axhline(
+            validation["baseline_auc5"][-1], color="black", linestyle=":", label="ratio + mutual, AUC@5"
+        )
+        axes[3].legend(fontsize="small")
+    axes[3].set(title="pose AUC behind LO-RANSAC, validation", xlabel="step")
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=90)
+
+
+def _measures(batches: Sequence[Batch]) -> dict[str, NDArray[np.float64]]:
+    """What real and synthetic pairs are compared by."""
+    found: dict[str, list[NDArray]] = {}
+    for batch in batches:
+        distances = batch.distances()
+        right = (distances < THRESHOLD) & batch.mask
+        wrong = ~right & batch.mask
+        motion = (batch.correspondences[..., 2:] - batch.correspondences[..., :2]).norm(dim=-1)
+        share = right.sum(1) / batch.mask.sum(1)
+        values = {
+            "inlier ratio of a pair": share,
+            "motion of right matches (focal lengths)": motion[right],
+            "motion of wrong matches (focal lengths)": motion[wrong],
+            "distance of wrong matches to the line (log₁₀)": distances[wrong].clamp(min=1e-9).log10() / 2,
+            "distance of right matches to the line (log₁₀)": distances[right].clamp(min=1e-12).log10() / 2,
+            "ratio, right": batch.ratios[right],
+            "ratio, wrong": batch.ratios[wrong],
+            "mutual share, right": (batch.mutual * right).sum(1) / right.sum(1).clamp(min=1),
+            "mutual share, wrong": (batch.mutual * wrong).sum(1) / wrong.sum(1).clamp(min=1),
+            "log scale ratio, right": batch.log_scale_ratios[right],
+            "cos rotation, right": batch.rotations[right].cos(),
+            "matches that share a point of image 1": _share_of_repeats(batch),
+        }
+        for name, value in values.items():
+            found.setdefault(name, []).append(value.double().cpu().numpy().ravel())
+    return {name: np.concatenate(parts) for name, parts in found.items()}
+
+
+def _share_of_repeats(batch: Batch) -> Any:
+    """Share (B,) of matches whose place in image 1 another match has too."""
+    places = (batch.correspondences[..., 2:] * 1e5).round().long()
+    keys = places[..., 0] * 1_000_003 + places[..., 1]
+    ordered = keys.sort(1).values
+    same = ordered[:, 1:] == ordered[:, :-1]
+    return same.double().mean(1)
+
+
+def plot_distributions(real: Sequence[Batch], synthetic: Sequence[Batch], output: Path) -> None:
+    """Draw a page of histograms that compare real and synthetic pairs into a PNG.
+
+    Parameters
+    ----------
+    real, synthetic : sequence of Batch
+        Without augmentation, so that the page shows what the sources are like.
+    output : Path
+    """
+    figure, axes = _figure(4, 3, 14, 14)
+    measures = {"real": _measures(real), "synthetic": _measures(synthetic)}
+    for axis, name in zip(axes, measures["real"], strict=True):
+        both = np.concatenate([measure[name] for measure in measures.values()])
+        bins = np.linspace(*np.quantile(both, [0.005, 0.995]), 41) if len(both) else 10
+        for kind, measure in measures.items():
+            axis.hist(measure[name], bins=bins, density=True, alpha=0.5, color=_COLOURS[kind], label=kind)
+        axis.set(title=name, yticks=[])
+    axes[0].legend()
+    output.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(output, dpi=70)
