@@ -66,15 +66,13 @@ def prepare(
 @click.option("--threads", default=0, show_default=True, help="Threads to use; 0 for all cores.")
 def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
     """Train by a recipe, alone or on several GPUs under torchrun."""
-    import torch
-
     from corrsfm.config import RunConfig
     from corrsfm.machine import device_of, use_threads
     from corrsfm.training.loop import train as train_by_recipe
 
     options = RunConfig(device=device, threads=threads)
     use_threads(options)
-    path = train_by_recipe(recipe, device=torch.device(device_of(options)), resume=resume, on_log=_echo_row)
+    path = train_by_recipe(recipe, device=device_of(options), resume=resume, on_log=_echo_row)
     click.echo(str(path))
 
 

@@ -64,7 +64,7 @@ def learning_rate_factor(progress: float, warm_up: float, schedule: Schedule) ->
 def train(
     recipe: TrainRecipe,
     *,
-    device: torch.device,
+    device: str | torch.device,
     resume: bool = False,
     on_log: Callable[[dict[str, Any]], None] | None = None,
 ) -> Path:
@@ -73,7 +73,7 @@ def train(
     Parameters
     ----------
     recipe : TrainRecipe
-    device : torch.device
+    device : str or torch.device
         Replaced by the process's own GPU under ``torchrun``.
     resume : bool
         Continue the run in the output folder, if there is one.
@@ -85,7 +85,7 @@ def train(
     Path
         The averaged weights.
     """
-    with _process_group(device) as (rank, own_device):
+    with _process_group(torch.device(device)) as (rank, own_device):
         data = RealPairs.from_files(recipe.train.train_files, own_device, recipe.train.scene_power)
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
         if resume and trainer.state_path.exists():

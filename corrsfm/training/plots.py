@@ -125,7 +125,8 @@ def plot_distributions(real: Sequence[Batch], synthetic: Sequence[Batch], output
     measures = {"real": _measures(real), "synthetic": _measures(synthetic)}
     for axis, name in zip(axes, measures["real"], strict=True):
         both = np.concatenate([measure[name] for measure in measures.values()])
-        bins = np.linspace(*np.quantile(both, [0.005, 0.995]), 41) if len(both) else 10
+        low, high = np.quantile(both, [0.005, 0.995])
+        bins = np.linspace(low, high, 41)
         for kind, measure in measures.items():
             axis.hist(measure[name], bins=bins, density=True, alpha=0.5, color=_COLOURS[kind], label=kind)
         axis.set(title=name, yticks=[])
