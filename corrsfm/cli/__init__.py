@@ -14,6 +14,7 @@ from corrsfm.cli.bench import bench
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
+from corrsfm.cli.train import train
 from corrsfm.errors import CorrsfmError
 
 __all__ = ["main"]
@@ -71,5 +72,6 @@ def main(quiet: bool) -> None:
         os.environ["TQDM_DISABLE"] = "1"
 
 
-for _command in (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate, bench):
+_COMMANDS = (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate, bench, train)
+for _command in _COMMANDS:
     main.add_command(_command)

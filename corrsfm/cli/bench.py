@@ -64,7 +64,9 @@ def bench(
     run: RunConfig,
     as_json: bool,
 ) -> None:
-    """Measure the network's speed and memory beside the published network, written plainly.
+    """Measure the network's speed and memory.
+
+    The reference is the published network, written plainly, in the same run.
 
     Numbers marked × are ratios to that reference on the same matches: of pairs per second, and of peak
     memory.

@@ -44,7 +44,7 @@ def compare(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Reconstruct the same photos with several prune methods and compare.
+    """Compare prune methods on the same photos.
 
     Features and matches are made once. The table goes to standard output, the page with the pairs that differ
     most to OUTPUT/compare.html.

@@ -67,7 +67,11 @@ def extract(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Index the photos, extract features, choose pairs and match them."""
+    """Index photos, extract features, match.
+
+    Lists the photos and their cameras, extracts SIFT features, chooses pairs and finds the nearest neighbour
+    of every keypoint, with its distance ratio and whether it is mutual.
+    """
     from corrsfm import pipeline
     from corrsfm.workspace import Workspace
 
@@ -106,7 +110,10 @@ def pairs(
 def match(
     workspace_dir: Path, config: cfg.MatchesConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
 ) -> None:
-    """Match the pairs: the nearest neighbour of every keypoint, with its ratio and whether it is mutual."""
+    """Match the chosen pairs again.
+
+    Every keypoint gets its nearest neighbour, with its distance ratio and whether it is mutual.
+    """
     from corrsfm import pipeline
 
     _show([_step(pipeline.match_pairs, workspace_dir, config, run, overwrite)], as_json)
@@ -126,7 +133,10 @@ def prune(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Prune the putative matches and write the COLMAP database with verified two-view geometries."""
+    """Prune matches and write the database.
+
+    What the method keeps of the putative matches is written to a COLMAP database and verified geometrically.
+    """
     from corrsfm import pipeline
 
     outcomes = [
@@ -145,7 +155,10 @@ def prune(
 def reconstruct(
     workspace_dir: Path, config: cfg.ReconstructionConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
 ) -> None:
-    """Map the verified matches into COLMAP models, the largest at sparse/0, and print the statistics."""
+    """Map the verified matches into models.
+
+    Writes COLMAP models, the largest at sparse/0, and prints the statistics.
+    """
     from corrsfm import pipeline
 
     _step(pipeline.reconstruct, workspace_dir, config, run, overwrite)
@@ -156,7 +169,10 @@ def reconstruct(
 @WORKSPACE
 @json_option
 def report(workspace_dir: Path, as_json: bool) -> None:
-    """Print the statistics of a reconstruction and write report.json and report.html."""
+    """Print the statistics and write the page.
+
+    Writes report.json and report.html, a page that needs nothing but itself.
+    """
     _print_report(workspace_dir, as_json, html=True)
 
 
@@ -169,7 +185,10 @@ def report(workspace_dir: Path, as_json: bool) -> None:
 def run(
     images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, overwrite: bool, as_json: bool
 ) -> None:
-    """Do everything: from a folder of photos to models and a report."""
+    """Do everything, from photos to a report.
+
+    Finished work is kept: after an interruption or a changed option, run the same command again.
+    """
     from corrsfm.run import run_scene
 
     run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
