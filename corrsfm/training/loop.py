@@ -343,13 +343,19 @@ class Trainer:
                 self._writer.add_scalar(f"{Path(name).stem}/{key}", value, row["step"])
 
     def _provenance(self) -> dict[str, Any]:
+        recipe = json.loads(json.dumps(to_dict(self.recipe), default=str))
+        # Names say what was used; where it lay is nobody's business.
+        recipe["train"]["train_files"] = [path.name for path in self.config.train_files]
+        recipe["train"]["output"] = self.config.output.name
+        if self.config.val_file is not None:
+            recipe["train"]["val_file"] = self.config.val_file.name
         return {
             "scenes": list(self.data.scene_names),
             "num_pairs": self.data.num_pairs,
             "steps": self.step,
             "minutes": round(self.minutes, 1),
             "seed": self.config.seed,
-            "recipe": json.loads(json.dumps(to_dict(self.recipe), default=str)),
+            "recipe": recipe,
             "hardware": f"{self.device.type}, {platform.machine()}, {torch.get_num_threads()} threads",
             "versions": {"corrsfm": __version__, "torch": str(torch.__version__), "numpy": np.__version__},
         }
