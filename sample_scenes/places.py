@@ -144,14 +144,14 @@ def paint_colonnade(rng: Rng, place: Place, detail: int) -> None:
     """Surfaces of the colonnade's own."""
     t, bay = textures, BAY
     place.surfaces |= {
-        # The facade repeats bay by bay: its period is the bay.
-        "facade": t.weather(rng, t.plaster(rng, detail, (bay, bay), (206, 150, 104), 0.5), 0.5, 0.05),
+        # Facade and floor repeat every second bay, the arches every fourth.
+        "facade": t.weather(rng, t.plaster(rng, detail, (2 * bay, 2 * bay), (206, 150, 104), 0.5), 0.5, 0.05),
         "ashlar": t.weather(
             rng,
             t.masonry(
                 rng,
                 detail,
-                (2 * bay, 2 * bay),
+                (4 * bay, 4 * bay),
                 (0.6, 0.3),
                 0.01,
                 ((196, 182, 154), (182, 168, 142), (206, 194, 168)),
@@ -165,7 +165,7 @@ def paint_colonnade(rng: Rng, place: Place, detail: int) -> None:
             t.masonry(
                 rng,
                 detail,
-                (bay, bay),
+                (2 * bay, 2 * bay),
                 (0.4, 0.4),
                 0.004,
                 ((178, 104, 74), (160, 94, 70), (196, 182, 156)),
@@ -175,7 +175,7 @@ def paint_colonnade(rng: Rng, place: Place, detail: int) -> None:
             0.4,
             0.1,
         ),
-        "paving": t.weather(rng, t.flagstones(rng, detail, (6.0, 6.0), 13), 0.5, 0.25),
+        "paving": t.weather(rng, t.flagstones(rng, detail, (12.0, 12.0), 26), 0.5, 0.25),
         "bills": t.paste_posters(
             rng, t.limestone(rng, detail // 2, (2.0, 2.0)), [(0.1, 0.2, 0.75), (1.05, 0.3, 0.8)]
         ),
@@ -184,7 +184,7 @@ def paint_colonnade(rng: Rng, place: Place, detail: int) -> None:
 
 
 def build_colonnade(rng: Rng, place: Place) -> None:
-    """The hall itself, its seven bays as equal as they can be."""
+    """The hall itself: seven bays of equal shape and equal windows."""
     bay, bays, gallery = BAY, 7, 3.0
     length = bay * bays
     place.add(shapes.box((60, 60, 0.2)), "paving", (0, -20, -0.35))
@@ -194,10 +194,11 @@ def build_colonnade(rng: Rng, place: Place) -> None:
     place.add(shapes.box((length + 0.8, 0.5, 0.3)), "stone", (0, 0.0, 4.4))
     place.add(shapes.tiled_roof(length + 1.0, 3.2, 1.3), "roof", (0, -0.4, 4.68))
     for index in range(bays + 1):
-        place.add(shapes.column(2.7, 0.2, 16), "marble", ((index - bays / 2) * bay, 0.0, 0))
+        place.add(shapes.column(2.7, 0.2, 16).shifted_uv(rng), "marble", ((index - bays / 2) * bay, 0.0, 0))
     for index in range(bays):
         x = (index - bays / 2 + 0.5) * bay
-        place.add(shapes.arch(bay, 4.4, bay / 2 - 0.22, 2.7, 0.4), "ashlar", (x, -0.2, 0))
+        arch = shapes.arch(bay, 4.4, bay / 2 - 0.22, 2.7, 0.4)
+        place.add(replace(arch, uv=arch.uv + [x, 0.0]), "ashlar", (x, -0.2, 0))
         add_window(place, rng, (x, gallery, 1.2), same=True)
     for side in (-1, 1):
         place.add(
@@ -231,10 +232,10 @@ def furnish_colonnade(rng: Rng, place: Place) -> None:
 
 def hard_shots(rng: Rng) -> list[Shot]:
     """Sixteen far-apart photos from two rows of viewpoints, light and camera settings changing throughout."""
-    lights = (Light(-135.0, 38.0), Light(-90.0, 55.0, 0.95, 0.0), Light(-55.0, 24.0, 0.4))
+    lights = (Light(-135.0, 38.0, 0.25, 0.75), Light(-90.0, 55.0, 0.95, 0.0), Light(-55.0, 24.0, 0.4, 0.6))
     casts = ((1.0, 1.0, 1.0), (0.94, 1.0, 1.10), (1.12, 1.0, 0.84))
-    near = arc_shots(rng, 8, (0.0, 1.0, 1.7), 7.2, 52.0, (1.5, 2.3), 0.7, 5.0)
-    far = arc_shots(rng, 8, (0.0, 1.0, 1.9), 10.0, 40.0, (1.7, 2.8, 1.3), 0.7, 5.0)
+    near = arc_shots(rng, 8, (0.0, 1.0, 1.7), 7.2, 44.0, (1.5, 2.3), 0.6, 5.0)
+    far = arc_shots(rng, 8, (0.0, 1.0, 1.9), 10.0, 36.0, (1.7, 2.8, 1.3), 0.6, 5.0)
     order = [shot for pair in zip(near, far, strict=True) for shot in pair]
     shots = []
     for index, shot in enumerate(order):

@@ -5,7 +5,7 @@ A development tool, needed only to make new pictures. In an environment of its o
 newer; where several are installed, `DRJIT_LIBLLVM_PATH` names the library). A photo takes 10 to 30 s.
 
     python sample_scenes/render.py courtyard --output sample_scenes/courtyard
-    python sample_scenes/render.py colonnade --output sample_scenes/colonnade
+    python sample_scenes/render.py colonnade --spp 20 --output sample_scenes/colonnade
     python sample_scenes/render.py random --seed 7 --num-photos 8 --output /tmp/place7
 
 The output folder receives `images/*.jpg` and a COLMAP text model (`cameras.txt`, `images.txt`,
