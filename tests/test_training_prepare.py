@@ -22,6 +22,7 @@ from corrsfm.training.prepare import (
     read_splits,
     scenes_of_split,
 )
+from corrsfm.workspace import StageRecord, Workspace
 
 
 def test_splits_of_the_photo_scenes_are_disjoint(shared_dir):
@@ -107,6 +108,21 @@ def test_both_layouts_train_alike(small_scene, tmp_path):
     )
     assert compact.correspondences.shape == oanet.correspondences.shape == (4, 200, 4)
     assert float(oanet.distances().min()) < 1e-5
+
+
+def test_a_workspace_is_a_scene(small_scene, tmp_path):
+    workspace = Workspace(tmp_path / "work", create=True)
+    workspace.images_dir = small_scene / "images"
+    workspace.finish("images", StageRecord(fingerprint="x"))
+    model = tmp_path / "work" / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (model / name).write_text((small_scene / name).read_text())
+    # Without covisibility.txt the pairs are those that share points of the model; this one has none.
+    with pytest.raises(InputError, match="no pair of photos"):
+        prepare_scene(tmp_path / "work", CONFIG)
+    (tmp_path / "work" / "covisibility.txt").write_text((small_scene / "covisibility.txt").read_text())
+    assert len(prepare_scene(tmp_path / "work", CONFIG).pairs) == 3
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path):

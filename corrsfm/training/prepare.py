@@ -1,7 +1,7 @@
 """Photo scenes with cameras → labelled pairs.
 
 A scene is a folder with ``images/`` and a COLMAP model (text or binary) beside it or in ``sparse/0`` or
-``model``. The pairs come from ``covisibility.txt`` (``name0 name1 count``) if there is one, else from the
+``model``, or the workspace of a reconstruction, which remembers where its photos are. The pairs come from ``covisibility.txt`` (``name0 name1 count``) if there is one, else from the
 model's points. What the features and matches are is decided by the same stages that inference runs.
 """
 
@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 
 from corrsfm.cameras import camera_from_pycolmap, normalise_points
 from corrsfm.compact import NO_NEIGHBOUR, CompactScene, write_scenes
-from corrsfm.errors import ImageError, InputError
+from corrsfm.errors import ImageError, InputError, WorkspaceError
 from corrsfm.features import extract_features
 from corrsfm.images import read_image
 from corrsfm.matches import match_features
 from corrsfm.oanet import pinhole_parameters, write_pairs
 from corrsfm.training.config import PrepareConfig
 from corrsfm.types import Camera, Features
+from corrsfm.workspace import Workspace
 
 __all__ = [
     "choose_pairs",
@@ -152,8 +153,9 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
     """
     folder = Path(folder)
     model = _read_model(folder)
+    images = _images_folder(folder)
     features = [
-        _features(folder / "images" / name, camera, config)
+        _features(images / name, camera, config)
         for name, camera in zip(model.names, model.cameras, strict=True)
     ]
     usable = {
@@ -201,6 +203,16 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
 
 def _offsets(parts: list) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum([len(part) for part in parts])]).astype(np.int64)
+
+
+def _images_folder(folder: Path) -> Path:
+    """Where the photos of a scene are."""
+    if (folder / "images").is_dir():
+        return folder / "images"
+    try:
+        return Workspace(folder).images_dir
+    except WorkspaceError as error:
+        raise InputError(f"{folder}: has no images/ and is not the workspace of a reconstruction") from error
 
 
 def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
