@@ -1,8 +1,9 @@
 """Photo scenes with cameras → labelled pairs.
 
 A scene is a folder with ``images/`` and a COLMAP model (text or binary) beside it or in ``sparse/0`` or
-``model``, or the workspace of a reconstruction, which remembers where its photos are. The pairs come from ``covisibility.txt`` (``name0 name1 count``) if there is one, else from the
-model's points. What the features and matches are is decided by the same stages that inference runs.
+``model``, or the workspace of a reconstruction, which remembers where its photos are. The pairs come from
+``covisibility.txt`` (``name0 name1 count``) if there is one, else from the model's points. What the
+features and matches are is decided by the same stages that inference runs.
 """
 
 from __future__ import annotations
