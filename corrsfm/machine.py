@@ -50,16 +50,15 @@ def device_of(run: RunConfig) -> str:
     return run.device
 
 
-def use_threads(run: RunConfig) -> None:
-    """Let torch use these threads."""
+def use_threads(num_threads: int) -> None:
+    """Let torch use so many threads for one operation."""
     import torch
 
-    torch.set_num_threads(threads_of(run))
+    torch.set_num_threads(num_threads)
 
 
-def threaded(work: Callable[[K], R], keys: Iterable[K], run: RunConfig) -> Iterator[tuple[K, R]]:
+def threaded(work: Callable[[K], R], keys: Iterable[K], num_threads: int) -> Iterator[tuple[K, R]]:
     """Results of ``work`` in the order of the keys, a few ahead of the consumer."""
-    num_threads = threads_of(run)
     with ThreadPoolExecutor(num_threads) as pool:
         waiting: list[tuple[K, Any]] = []
         iterator = iter(keys)

@@ -8,6 +8,7 @@ Among equal distances the lowest keypoint index wins.
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable
 
@@ -53,7 +54,7 @@ def match_features(
 
 
 class Matcher:
-    """Matches pairs of a scene, keeping recently used descriptors on the device.
+    """Matches pairs of a scene, keeping recently used descriptors on the device; threads may share it.
 
     Parameters
     ----------
@@ -81,18 +82,20 @@ class Matcher:
         self._block_size = block_size
         self._max_cached = max(2, max_cached_images)
         self._cache: OrderedDict[str, _Prepared] = OrderedDict()
+        self._lock = threading.Lock()
 
     def match(self, name0: str, name1: str) -> Matches:
         """Putative matches of a pair of images; the same as `match_features` on their descriptors."""
         return _match(self._prepared(name0), self._prepared(name1), self._block_size)
 
     def _prepared(self, name: str) -> _Prepared:
-        if name not in self._cache:
-            self._cache[name] = _Prepared(self._load(name), self._device)
-            if len(self._cache) > self._max_cached:
-                self._cache.popitem(last=False)
-        self._cache.move_to_end(name)
-        return self._cache[name]
+        with self._lock:
+            if name not in self._cache:
+                self._cache[name] = _Prepared(self._load(name), self._device)
+                if len(self._cache) > self._max_cached:
+                    self._cache.popitem(last=False)
+            self._cache.move_to_end(name)
+            return self._cache[name]
 
 
 class _Prepared:

@@ -125,7 +125,7 @@ def extract_features(
             return error
 
     def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
-        for name, result in threaded(work, missing, run):
+        for name, result in threaded(work, missing, threads_of(run)):
             if isinstance(result, Features):
                 yield name, result
             elif images.config.get("skip_unreadable"):
@@ -195,15 +195,15 @@ def match_pairs(
     pairs = workspace.require("pairs")
     store = ItemStore(workspace.features, FEATURES)
     wanted = _wanted_matches(workspace)
-    use_threads(run)
+    device = device_of(run)
+    # On a CPU a thread takes a pair: threads that share a pair wait for each other at every step.
+    on_cpu = device == "cpu"
+    use_threads(1 if on_cpu else threads_of(run))
     with store.reader() as read:
-        matcher = Matcher(
-            lambda name: read(name).descriptors, device=device_of(run), block_size=config.block_size
-        )
+        matcher = Matcher(lambda name: read(name).descriptors, device=device, block_size=config.block_size)
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, Matches]]:
-            for pair in missing:
-                yield pair, matcher.match(*pair)
+            return threaded(lambda pair: matcher.match(*pair), missing, threads_of(run) if on_cpu else 1)
 
         return complete(
             workspace,
@@ -238,7 +238,7 @@ def prune_matches(
         pair: config_hash("prune", fingerprint, pruner.fingerprint, cameras[pair[0]], cameras[pair[1]])
         for pair, fingerprint in match_fingerprints.items()
     }
-    use_threads(run)
+    use_threads(threads_of(run))
     with ItemStore(workspace.features, FEATURES).reader() as load, putative.reader() as read_matches:
         read_features = functools.lru_cache(maxsize=CACHED_IMAGES)(load)
 

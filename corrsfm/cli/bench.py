@@ -72,9 +72,9 @@ def bench(
     memory.
     """  # fmt: skip
     from corrsfm.benchmark import format_rows, run_benchmark
-    from corrsfm.machine import device_of, use_threads
+    from corrsfm.machine import device_of, threads_of, use_threads
 
-    use_threads(run)
+    use_threads(threads_of(run))
     devices = sorted({"cpu", device_of(run)}) if run.device == "auto" else [device_of(run)]
     rows = run_benchmark(
         model=model,

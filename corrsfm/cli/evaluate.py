@@ -39,9 +39,9 @@ def command_line() -> str:
 
 
 def _device(run: RunConfig) -> str:
-    from corrsfm.machine import device_of, use_threads
+    from corrsfm.machine import device_of, threads_of, use_threads
 
-    use_threads(run)
+    use_threads(threads_of(run))
     return device_of(run)
 
 
