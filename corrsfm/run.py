@@ -5,22 +5,24 @@ from __future__ import annotations
 import platform
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.errors import ReconstructionError
 from corrsfm.index import read_index
 from corrsfm.machine import versions
-from corrsfm.resume import StageOutcome
 from corrsfm.workspace import STAGE_COMMANDS, Workspace, atomic_write_json
+
+if TYPE_CHECKING:
+    from corrsfm.report import SceneReport
 
 __all__ = ["run_scene"]
 
 
 def run_scene(
     images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
-) -> list[StageOutcome]:
+) -> SceneReport:
     """Go from a folder of photos to models and a report, skipping what is finished.
 
     Parameters
@@ -32,7 +34,8 @@ def run_scene(
 
     Returns
     -------
-    list of StageOutcome
+    SceneReport
+        As in `report.json`.
 
     Raises
     ------
@@ -42,22 +45,19 @@ def run_scene(
     workspace = Workspace(workspace_dir, create=True)
     run = config.run
     with workspace.lock():
-        outcomes = [
-            pipeline.index_photos(workspace, images_dir, config.images, run),
-            pipeline.extract_features(workspace, config.features, run, overwrite=overwrite),
-            pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite),
-            pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite),
-            pipeline.prune_matches(workspace, config.prune, run, overwrite=overwrite),
-            pipeline.verify_matches(workspace, config.database, run, overwrite=overwrite),
-        ]
+        pipeline.index_photos(workspace, images_dir, config.images, run)
+        pipeline.extract_features(workspace, config.features, run, overwrite=overwrite)
+        pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite)
+        pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite)
+        pipeline.prune_matches(workspace, config.prune, run, overwrite=overwrite)
+        pipeline.verify_matches(workspace, config.database, run, overwrite=overwrite)
         try:
-            outcomes.append(pipeline.reconstruct(workspace, config.reconstruction, run, overwrite=overwrite))
+            pipeline.reconstruct(workspace, config.reconstruction, run, overwrite=overwrite)
         except ReconstructionError:
             pipeline.report(workspace, html=True)
             raise
         atomic_write_json(workspace.run_json, _run_record(workspace, config))
-        pipeline.report(workspace, html=True)
-    return outcomes
+        return pipeline.report(workspace, html=True)
 
 
 def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from corrsfm.cli.options import (
 
 if TYPE_CHECKING:
     from corrsfm.pipeline import StageOutcome
+    from corrsfm.report import SceneReport
 
 __all__ = ["extract", "match", "pairs", "prune", "reconstruct", "report", "run"]
 
@@ -191,24 +192,27 @@ def run(
     """
     from corrsfm.run import run_scene
 
-    run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
-    _print_report(workspace_dir, as_json)
-    if not as_json:
-        click.echo(f"\nreport: {workspace_dir / 'report.html'}")
+    result = run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
+    _show_report(result, as_json, workspace_dir / "report.html")
 
 
 def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> None:
-    """The statistics on standard output; report.json always, report.html if asked for."""
+    """Gather and show the statistics; report.json is written always, report.html if asked for."""
     from corrsfm import pipeline
-    from corrsfm.report import format_table
     from corrsfm.workspace import Workspace
 
     workspace = Workspace(workspace_dir)
     with workspace.lock():
         result = pipeline.report(workspace, html=html)
+    _show_report(result, as_json, workspace.report_html if html else None)
+
+
+def _show_report(report: SceneReport, as_json: bool, page: Path | None) -> None:
+    from corrsfm.report import format_table
+
     if as_json:
-        echo_json(result.to_dict())
-    else:
-        click.echo(format_table(result))
-        if html:
-            click.echo(f"\nreport: {workspace.report_html}")
+        echo_json(report.to_dict())
+        return
+    click.echo(format_table(report))
+    if page is not None:
+        click.echo(f"\nreport: {page}")
