@@ -59,8 +59,7 @@ def assign_cameras(
         One per name.
     mode : CameraMode
         ``auto`` shares a camera among photos of equal size, EXIF camera and focal length. Photos without EXIF
-        share one if they all have the same size, as the frames of a video have, and get one each, as in
-        COLMAP, if their sizes differ, as those of photos from the web do.
+        get one each, as in COLMAP: equal size is no proof, and a wrongly shared camera ruins a model.
     model : str
         COLMAP camera model.
     params : str
@@ -82,11 +81,7 @@ def assign_cameras(
         If photos of one camera differ in size.
     """
     values = _parse_params(model, params)
-    sizes_without_exif = {(info.width, info.height) for info in infos if not _has_exif(info)}
-    keys = [
-        _camera_key(name, info, mode, share_without_exif=len(sizes_without_exif) == 1)
-        for name, info in zip(names, infos, strict=True)
-    ]
+    keys = [_camera_key(name, info, mode) for name, info in zip(names, infos, strict=True)]
     first = {key: index for index, key in reversed(list(enumerate(keys)))}
     for name, info, key in zip(names, infos, keys, strict=True):
         reference = infos[first[key]]
@@ -103,18 +98,15 @@ def assign_cameras(
     return cameras, [position[key] for key in keys]
 
 
-def _has_exif(info: PhotoInfo) -> bool:
-    return info.camera_name is not None or info.focal_px is not None
-
-
-def _camera_key(name: str, info: PhotoInfo, mode: CameraMode, *, share_without_exif: bool) -> tuple:
+def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
     """Equal for photos that share a camera."""
+    has_exif = info.camera_name is not None or info.focal_px is not None
     match mode:
         case CameraMode.SINGLE:
             return ()
         case CameraMode.PER_FOLDER:
             return (PurePosixPath(name).parent.as_posix(),)
-        case CameraMode.AUTO if _has_exif(info) or share_without_exif:
+        case CameraMode.AUTO if has_exif:
             return (info.width, info.height, info.camera_name, info.focal_px)
     return (name,)
 

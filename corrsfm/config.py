@@ -138,8 +138,8 @@ class ImagesConfig:
     )
     camera_mode: CameraMode = option(
         CameraMode.AUTO,
-        "Photos that share a camera; auto groups equal size, make, model and focal length, and all photos "
-        "without EXIF if they have one size",
+        "Photos that share a camera; auto groups equal size, make, model and focal length, and gives photos "
+        "without EXIF one each",
     )
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
     skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")

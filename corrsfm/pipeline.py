@@ -9,6 +9,7 @@ import functools
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,6 +102,7 @@ def extract_features(
     ImageError
         Naming every photo that cannot be read; the features of the others are kept.
     """
+    from corrsfm.colmap import colmap_log
     from corrsfm.features import create_extractor
     from corrsfm.images import read_image, read_mask
 
@@ -140,17 +142,18 @@ def extract_features(
                 "the others are kept"
             )
 
-    return complete(
-        workspace,
-        "features",
-        ItemStore(workspace.features, FEATURES),
-        wanted,
-        produce,
-        config,
-        inputs={"images": images.fingerprint},
-        overwrite=overwrite,
-        unit="photo",
-    )
+    with colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext():
+        return complete(
+            workspace,
+            "features",
+            ItemStore(workspace.features, FEATURES),
+            wanted,
+            produce,
+            config,
+            inputs={"images": images.fingerprint},
+            overwrite=overwrite,
+            unit="photo",
+        )
 
 
 def make_pairs(

@@ -24,14 +24,9 @@ def test_auto_shares_a_camera_among_photos_with_the_same_exif() -> None:
     assert ids_of([PHONE, ZOOMED, PHONE, TALL, PHONE], CameraMode.AUTO) == [0, 1, 0, 2, 0]
 
 
-def test_auto_shares_a_camera_among_photos_without_exif_if_all_have_one_size() -> None:
-    assert ids_of([PLAIN, PLAIN, PLAIN], CameraMode.AUTO) == [0, 0, 0]
-    assert ids_of([PLAIN, PHONE, PLAIN, TALL], CameraMode.AUTO) == [0, 1, 0, 2]
-
-
-def test_auto_gives_photos_without_exif_of_several_sizes_a_camera_each() -> None:
-    other = PhotoInfo(width=600, height=480)
-    assert ids_of([PLAIN, PHONE, PLAIN, PHONE, other], CameraMode.AUTO) == [0, 1, 2, 1, 3]
+def test_auto_gives_every_photo_without_exif_a_camera_of_its_own() -> None:
+    assert ids_of([PLAIN, PLAIN, PLAIN], CameraMode.AUTO) == [0, 1, 2]
+    assert ids_of([PLAIN, PHONE, PLAIN, PHONE], CameraMode.AUTO) == [0, 1, 2, 1]
 
 
 def test_single_shares_one_camera_and_per_image_none() -> None:
