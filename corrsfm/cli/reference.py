@@ -28,7 +28,8 @@ def render_reference() -> str:
     """The reference as Markdown."""
     from corrsfm.cli import main
 
-    root = click.Context(main, info_name="corrsfm", terminal_width=100, max_content_width=100)
+    settings = {**main.context_settings, "terminal_width": 100, "max_content_width": 100}
+    root = click.Context(main, info_name="corrsfm", **settings)
     sections = [
         f"## {context.command_path}\n\n```\n{context.get_help()}\n```\n" for context in _commands(main, root)
     ]
