@@ -203,9 +203,7 @@ def test_degenerate_matches_give_finite_scores(network, num, case):
     assert not np.isnan(result.residuals).any() or result.model is None
 
 
-def test_filtered_matches_are_warned_about_once(network, caplog, monkeypatch):
-    # The command line, run by other tests, keeps the package's log to itself.
-    monkeypatch.setattr(logging.getLogger("corrsfm"), "propagate", True)
+def test_filtered_matches_are_warned_about_once(network, caplog):
     filtered = dataclasses.replace(make(num=100), ratios=np.full(100, 0.5, np.float32), name="a – b")
     pruner = pruner_of(network)
     with caplog.at_level(logging.WARNING):

@@ -64,7 +64,6 @@ def main(quiet: bool) -> None:
     logger = logging.getLogger("corrsfm")
     logger.handlers = [_Handler()]
     logger.setLevel(logging.WARNING if quiet else logging.INFO)
-    logger.propagate = False
     if quiet:
         import os
 
