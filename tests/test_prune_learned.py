@@ -157,15 +157,10 @@ def test_operating_points_keep_what_they_promise():
     pair = make(num=100, inlier_ratio=1.0)
     pair = dataclasses.replace(pair, mutual=np.arange(100) % 2 == 0)
     scores = np.full(100, 0.2, np.float32)
-    scores[:10], scores[10:80] = 0.95, 0.6
+    scores[:10], scores[10:80] = 0.95, 0.4
     assert np.flatnonzero(select_kept(pair, scores, OperatingPoint.POSE)).tolist() == list(range(10))
     sfm = select_kept(pair, scores, OperatingPoint.SFM)
     assert np.flatnonzero(sfm).tolist() == list(range(0, 80, 2))
-    # Too few above the score: the best mutual ones fill up to thirty, but nothing without any confidence.
-    scores = np.linspace(0.0, 0.3, 100).astype(np.float32)
-    sfm = select_kept(pair, scores, OperatingPoint.SFM)
-    assert np.flatnonzero(sfm).tolist() == list(range(40, 100, 2))
-    assert not select_kept(pair, np.zeros(100, np.float32), OperatingPoint.SFM).any()
 
 
 def test_unseen_matches_are_scored_by_a_matrix_as_far_as_it_is_trusted():

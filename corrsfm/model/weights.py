@@ -65,10 +65,32 @@ class BundledCheckpoint:
     """Measured result, with the data it was measured on."""
 
 
-REGISTRY: dict[str, BundledCheckpoint] = {}
+REGISTRY: dict[str, BundledCheckpoint] = {
+    row.name: row
+    for row in (
+        BundledCheckpoint(
+            name="small-side",
+            file="small-side.pt",
+            sha256="8e4a436443c23c8b9cefe5b1a7a815bdd449443b59821765855b5f32a4661ede",
+            config=NetworkConfig(
+                channels=32,
+                clusters=48,
+                neighbors=(6, 3),
+                heads=2,
+                mlp_ratio=2,
+                motion_stacking=1,
+                oa_filters=1,
+                side_channels=5,
+            ),
+            licence="Apache-2.0",
+            training_data="9,428 pairs of 54 photo scenes with COLMAP poses; the model card names them",
+            score="AUC@5° 69.8 against 67.2 of ratio + mutual, LO-RANSAC behind both, 240 validation pairs",
+        ),
+    )
+}
 """Bundled checkpoints by name."""
 
-DEFAULT_CHECKPOINT: str | None = None
+DEFAULT_CHECKPOINT: str | None = "small-side"
 """Name of the one that is loaded when none is asked for."""
 
 
