@@ -199,7 +199,7 @@ class PruneConfig:
     max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", minimum=0)
     max_candidates: int = option(2000, "Matches per pair that the network sees, best ratio first", minimum=16)
     precision: Precision = option(
-        Precision.AUTO, "Number format of the network; auto is bfloat16 where the processor has it"
+        Precision.AUTO, "Number format of the network; auto is bfloat16 where it is faster"
     )
     max_batch_matches: int = option(
         16000,

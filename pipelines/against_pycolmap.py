@@ -100,7 +100,9 @@ def main() -> None:
             arguments.results,
             "pycolmap",
             {
-                "provenance": provenance(seed=0, command="python " + " ".join(sys.argv)),
+                "provenance": provenance(
+                    seed=0, command=" ".join(["python pipelines/against_pycolmap.py", *sys.argv[1:]])
+                ),
                 "subject": {"max_features": arguments.max_features},
                 "rows": rows,
             },

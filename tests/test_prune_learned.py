@@ -41,7 +41,8 @@ def make(seed=0, num=120, inlier_ratio=0.5):
 
 
 def pruner_of(network, **options):
-    return Pruner(network, device="cpu", **{"precision": Precision.FLOAT32, **options})
+    defaults = {"precision": Precision.FLOAT32, "batched": True, "threads": 2}
+    return Pruner(network, device="cpu", **{**defaults, **options})
 
 
 def assert_equal_results(results, others):
@@ -62,6 +63,13 @@ def test_batches_of_mixed_sizes_equal_one_by_one(network, point):
     together = pruner(pairs)
     assert_equal_results(together, [pruner([pair])[0] for pair in pairs])
     assert [result.model is None for result in together] == [len(pair) < 32 for pair in pairs]
+
+
+def test_a_pair_a_thread_equals_batches_and_leaves_torchs_threads_alone(network):
+    pairs = [make(seed, num) for seed, num in enumerate([60, 0, 200, 8, 133])]
+    before = torch.get_num_threads()
+    assert_equal_results(pruner_of(network, batched=False)(pairs), pruner_of(network)(pairs))
+    assert torch.get_num_threads() == before
 
 
 def test_small_batches_equal_large_ones(network):
@@ -223,10 +231,11 @@ def test_auto_precision_never_chooses_emulation(monkeypatch):
     device = torch.device("cpu")
     for question in ("_is_avx512_bf16_supported", "_is_amx_tile_supported"):
         monkeypatch.setattr(torch.cpu, question, lambda: False, raising=False)
-    assert choose_precision(Precision.AUTO, device) is torch.float32
-    assert choose_precision(Precision.BFLOAT16, device) is torch.bfloat16
+    assert choose_precision(Precision.AUTO, device, 128) is torch.float32
+    assert choose_precision(Precision.BFLOAT16, device, 128) is torch.bfloat16
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
-    assert choose_precision(Precision.AUTO, device) is torch.bfloat16
+    assert choose_precision(Precision.AUTO, device, 128) is torch.bfloat16
+    assert choose_precision(Precision.AUTO, device, 32) is torch.float32
 
 
 def test_unknown_device_is_an_error():

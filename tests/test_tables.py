@@ -94,3 +94,11 @@ def test_tables_of_the_documents_match_the_results(repository: Path):
         assert render_document(text, repository / "results", where=str(file)) == text, (
             f"{file}: run: corrsfm evaluate tables {file}"
         )
+
+
+@pytest.mark.parametrize("name", ["against_pycolmap", "bench_published"])
+def test_other_results_of_the_project_have_a_table(repository: Path, name: str):
+    values = load_results(repository / "results" / f"{name}.json")
+    table = render_table(values)
+    assert len(values["rows"]) >= 4
+    assert table.count("\n| ") >= len(values["rows"])

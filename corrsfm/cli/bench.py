@@ -53,6 +53,7 @@ __all__ = ["bench"]
     "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timed repetitions."
 )
 @run_options
+@click.option("--results", type=click.Path(path_type=Path), help="Also write a result file here.")
 @json_option
 def bench(
     model: Path | None,
@@ -62,6 +63,7 @@ def bench(
     compile: bool,
     repeats: int,
     run: RunConfig,
+    results: Path | None,
     as_json: bool,
 ) -> None:
     """Measure the network's speed and memory.
@@ -72,6 +74,8 @@ def bench(
     memory.
     """  # fmt: skip
     from corrsfm.benchmark import format_rows, run_benchmark
+    from corrsfm.cli.evaluate import command_line
+    from corrsfm.evaluation.records import provenance, save_results
     from corrsfm.machine import device_of, threads_of, use_threads
 
     use_threads(threads_of(run))
@@ -86,6 +90,16 @@ def bench(
         repeats=repeats,
         seed=run.seed,
     )
+    if results is not None:
+        save_results(
+            results,
+            "bench",
+            {
+                "provenance": provenance(seed=run.seed, command=command_line(), device=devices[-1]),
+                "subject": {"model": str(model or "the published architecture"), "threads": threads_of(run)},
+                "rows": [dataclasses.asdict(row) for row in rows],
+            },
+        )
     if as_json:
         echo_json([dataclasses.asdict(row) for row in rows])
     else:

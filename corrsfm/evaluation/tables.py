@@ -144,6 +144,25 @@ def _pycolmap_table(values: dict[str, Any]) -> str:
     return f"{_markdown(header, rows)}\n\n{caption}"
 
 
+def _bench_table(values: dict[str, Any]) -> str:
+    header = ["matches", "batch", "device", "variant", "pairs/s", "speed ×", "memory ×"]
+    rows = [
+        [
+            str(row["num_matches"]),
+            str(row["batch_size"]),
+            row["device"],
+            row["variant"],
+            _number(row["pairs_per_second"], 2),
+            _number(row["speed_ratio"], 2),
+            _number(row["memory_ratio"], 2),
+        ]
+        for row in values["rows"]
+    ]
+    subject, machine = values["subject"], values["provenance"]["machine"]
+    caption = f"Network: {subject['model']}. {subject['threads']} threads of {machine['processor']}."
+    return f"{_markdown(header, rows)}\n\n{caption}"
+
+
 def _origin(values: dict[str, Any]) -> str:
     """Where a table comes from: versions and seed, for a caption."""
     versions = values["provenance"]["versions"]
@@ -165,6 +184,7 @@ _RENDERERS: dict[str, Callable[[dict[str, Any]], str]] = {
     "homography": _homography_table,
     "compare": _compare_table,
     "pycolmap": _pycolmap_table,
+    "bench": _bench_table,
 }
 
 

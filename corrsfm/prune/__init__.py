@@ -101,11 +101,11 @@ def build_pruner(
     if config.method is PruneMethod.RATIO:
         return RatioPruner(config.max_ratio)
     if config.method is PruneMethod.CORRADAPTOR:
-        return _load_network_pruner(config, device)
+        return _load_network_pruner(config, device, threads)
     if config.method is PruneMethod.CASCADE:
         from corrsfm.prune.cascade import CascadePruner
 
-        network = _load_network_pruner(config, device) if checkpoint_sha256(config) else None
+        network = _load_network_pruner(config, device, threads) if checkpoint_sha256(config) else None
         return CascadePruner(
             network,
             network_fingerprint=network.fingerprint if network else "",
@@ -143,7 +143,7 @@ def checkpoint_sha256(config: PruneConfig) -> str | None:
     return sha256_of(config.model)
 
 
-def _load_network_pruner(config: PruneConfig, device: str) -> Pruner:
+def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Pruner:
     # Here, not above: it loads torch.
     from corrsfm.prune.learned import Pruner
 
@@ -154,6 +154,7 @@ def _load_network_pruner(config: PruneConfig, device: str) -> Pruner:
         max_candidates=config.max_candidates,
         max_batch_matches=config.max_batch_matches,
         precision=config.precision,
+        threads=threads,
     )
 
 

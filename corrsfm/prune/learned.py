@@ -9,6 +9,8 @@ import hashlib
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,8 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.config import OperatingPoint, Precision
+from corrsfm.config import OperatingPoint, Precision, RunConfig
 from corrsfm.errors import CheckpointError, ConfigError, CorrsfmError
+from corrsfm.machine import threads_of
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.robust import normalised_residuals
@@ -45,6 +48,8 @@ SFM_MIN_SCORE = 0.3
 
 # Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
 MAX_RESIDUAL = 1e-4
+
+MIN_BFLOAT16_CHANNELS = 64
 
 # The guard speaks only about pairs that can show what they are.
 _GUARD_MIN_MATCHES = 50
@@ -87,10 +92,16 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def choose_precision(precision: Precision, device: torch.device) -> torch.dtype:
-    """Number format to compute in; ``auto`` is bfloat16 only where the processor multiplies it natively."""
+def choose_precision(precision: Precision, device: torch.device, channels: int) -> torch.dtype:
+    """Number format to compute in.
+
+    ``auto`` is bfloat16 where the processor multiplies it natively and the network is wide enough for that to
+    pay: with 32 channels the conversions cost more than the products save.
+    """
     if precision is not Precision.AUTO:
         return torch.bfloat16 if precision is Precision.BFLOAT16 else torch.float32
+    if channels < MIN_BFLOAT16_CHANNELS:
+        return torch.float32
     if device.type == "cuda":
         native = torch.cuda.get_device_capability(device)[0] >= 8
     else:
@@ -217,6 +228,11 @@ class Pruner:
     max_batch_matches : int
         Bound of the matches in a batch, padding included; bounds memory.
     precision : Precision
+    threads : int
+        Pairs at a time on a CPU; 0 for all cores.
+    batched : bool, optional
+        Run several pairs as one batch. If not given, so on a GPU; on a CPU a thread takes a pair, because
+        padding costs more there than a batch gains and threads that share a pair wait for each other.
     compile : bool
         Compile the network; pays off on a GPU for many pairs.
     """
@@ -233,10 +249,14 @@ class Pruner:
         max_candidates: int = 2000,
         max_batch_matches: int = 16_000,
         precision: Precision = Precision.AUTO,
+        threads: int = 0,
+        batched: bool | None = None,
         compile: bool = False,
     ) -> None:
         self.device = choose_device(device)
-        self.dtype = choose_precision(precision, self.device)
+        self.dtype = choose_precision(precision, self.device, network.head.linear1.in_features)
+        self._num_threads = threads_of(RunConfig(threads=threads))
+        self._batched = self.device.type != "cpu" if batched is None else batched
         self._side_channels = network.side_channels
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
         self._network: Callable = network.to(self.device).eval()
@@ -306,10 +326,16 @@ class Pruner:
             NetworkEstimate(logits=np.full(len(pair), -np.inf, np.float32), essential=None) for pair in pairs
         ]
         todo = [index for index, rows in enumerate(candidates) if len(rows)]
+        if not self._batched:
+            with _one_thread_an_operation(), ThreadPoolExecutor(self._num_threads) as pool:
+                outputs = pool.map(lambda index: next(self._run([(pairs[index], candidates[index])])), todo)
+                for index, estimate in zip(todo, outputs, strict=True):
+                    estimates[index] = estimate
+            return estimates
         for batch in pack_batches([len(candidates[index]) for index in todo], self._max_batch_matches):
             members = [todo[position] for position in batch]
-            outputs = self._run([(pairs[index], candidates[index]) for index in members])
-            for index, estimate in zip(members, outputs, strict=True):
+            batch_outputs = self._run([(pairs[index], candidates[index]) for index in members])
+            for index, estimate in zip(members, batch_outputs, strict=True):
                 estimates[index] = estimate
         return estimates
 
@@ -389,6 +415,16 @@ class Pruner:
                     100 * float(np.mean(pair.mutual)),
                 )
                 return
+
+
+@contextmanager
+def _one_thread_an_operation() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def sha256_of(path: Path | None) -> str:
