@@ -45,6 +45,8 @@ _MIN_NUM_FOR_MATRIX = 8
 # Scores from which on a match is kept, see `select_kept`.
 POSE_MIN_SCORE = 0.5
 SFM_MIN_SCORE = 0.3
+CONFIDENT_SCORE = 0.7
+MIN_NUM_CONFIDENT = 15
 
 # Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
 MAX_RESIDUAL = 1e-4
@@ -174,7 +176,9 @@ def select_kept(
     scores : (M,) float32
         Confidence of the network in each match, in [0, 1].
     operating_point : OperatingPoint
-        ``pose``: score above 0.5. ``sfm``: mutual matches with a score above 0.3.
+        ``pose``: score above 0.5. ``sfm``: mutual matches with a score above 0.3; of a pair with fewer than
+        15 above 0.7, which as a rule shows two places, only those. (Of 114 pairs of a validation scene that
+        share nothing, 110 passed COLMAP's verification without this.)
 
     Returns
     -------
@@ -182,6 +186,9 @@ def select_kept(
     """
     if operating_point is OperatingPoint.POSE:
         return scores > POSE_MIN_SCORE
+    confident = pair.mutual & (scores > CONFIDENT_SCORE)
+    if np.count_nonzero(confident) < MIN_NUM_CONFIDENT:
+        return confident
     return pair.mutual & (scores > SFM_MIN_SCORE)
 
 
@@ -267,7 +274,7 @@ class Pruner:
         self._max_batch_matches = max_batch_matches
         self._warned = False
         self.fingerprint = (
-            f"corradaptor sha256={checkpoint_sha256} operating_point={operating_point} "
+            f"corradaptor-2 sha256={checkpoint_sha256} operating_point={operating_point} "
             f"max_candidates={max_candidates} dtype={self.dtype}"
         )
 
