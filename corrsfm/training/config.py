@@ -78,6 +78,7 @@ class TrainConfig:
     train_files: tuple[Path, ...] = option((), "Compact files of the training scenes")
     val_file: Path | None = option(None, "Compact file of the validation scenes")
     output: Path = option(Path("training"), "Folder of the run: log, checkpoints")
+    initial: str = option("", "Checkpoint, or name of a bundled one, whose weights the run starts from")
     synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0)
     batch_size: int = option(32, "Pairs in a batch, on each device", minimum=1)
     num_matches: int = option(2000, "Matches drawn from each pair", minimum=32)

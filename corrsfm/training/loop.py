@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from corrsfm import __version__
 from corrsfm.config import from_dict, to_dict
 from corrsfm.errors import ConfigError, DependencyError
-from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
+from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
 from corrsfm.training.checkpoint import Average, load_state, save_state
 from corrsfm.training.config import Schedule, TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_channels
@@ -36,7 +36,7 @@ from corrsfm.training.losses import classification_loss, essential_loss, virtual
 from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
 
-__all__ = ["Trainer", "learning_rate_factor", "network_config", "train"]
+__all__ = ["Trainer", "initial_network", "learning_rate_factor", "network_config", "train"]
 
 logger = logging.getLogger(__name__)
 
@@ -98,6 +98,30 @@ def network_config(recipe: TrainRecipe) -> NetworkConfig:
     return from_dict(NetworkConfig, recipe.network, "network")
 
 
+def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
+    """The network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
+
+    Raises
+    ------
+    CheckpointError
+        If that checkpoint cannot be read.
+    ConfigError
+        If the recipe's ``network`` table describes another network than the checkpoint holds; without a table
+        the checkpoint decides.
+    """
+    config = network_config(recipe)
+    if not recipe.train.initial:
+        return CorrAdaptor.from_config(config)
+    network = load_network(recipe.train.initial)
+    assert network.config is not None
+    if recipe.network and network.config != config:
+        raise ConfigError(
+            f"network: is not that of the initial checkpoint {recipe.train.initial}, which is "
+            f"{to_dict(network.config)}; leave the table out to continue with that network"
+        )
+    return network
+
+
 @contextmanager
 def _process_group(device: torch.device) -> Iterator[tuple[int, torch.device]]:
     """Rank and device of this process; joins the processes that ``torchrun`` started."""
@@ -140,7 +164,7 @@ class Trainer:
         self.recipe, self.config, self.data, self.device, self.rank = recipe, recipe.train, data, device, rank
         self._on_log = on_log
         torch.manual_seed(self.config.seed)
-        self.network = CorrAdaptor.from_config(network_config(recipe)).to(device)
+        self.network = initial_network(recipe).to(device)
         self._synthetic = SyntheticPairs(recipe.synthetic, device)
         self.average = Average(self.network, self.config.ema_decay)
         self.optimiser = torch.optim.AdamW(
@@ -347,6 +371,7 @@ class Trainer:
         # Names say what was used; where it lay is nobody's business.
         recipe["train"]["train_files"] = [path.name for path in self.config.train_files]
         recipe["train"]["output"] = self.config.output.name
+        recipe["train"]["initial"] = Path(self.config.initial).name
         if self.config.val_file is not None:
             recipe["train"]["val_file"] = self.config.val_file.name
         return {
