@@ -5,10 +5,10 @@
     prune/
     ├── __init__.py          the interface and `build_pruner`; imports nothing heavy
     ├── correspondences.py   putative matches as methods see them, shared with training
-    ├── robust.py            LO-RANSAC, MAGSAC++ and the comparison of two-view models
+    ├── robust.py            LO-RANSAC, MAGSAC++ and the errors to a model
     ├── classical.py         none, ratio, loransac, magsac
     ├── learned.py           corradaptor: owns device, batches and memory
-    └── cascade.py           classical where it is beyond doubt, the network elsewhere
+    └── cascade.py           the ratio test where it is enough, the network elsewhere
 
 Modules of this folder import each other downwards in the order robust < classical < learned < cascade.
 """
@@ -105,15 +105,8 @@ def build_pruner(
     if config.method is PruneMethod.CASCADE:
         from corrsfm.prune.cascade import CascadePruner
 
-        network = _load_network_pruner(config, device, threads) if checkpoint_sha256(config) else None
-        return CascadePruner(
-            network,
-            network_fingerprint=network.fingerprint if network else "",
-            max_ratio=config.max_ratio,
-            max_error_px=config.max_error_px,
-            seed=seed,
-            threads=threads,
-        )
+        network = _load_network_pruner(config, device, threads)
+        return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=config.max_ratio)
     return EstimatorPruner(
         str(config.method),
         max_ratio=config.max_ratio,
@@ -126,20 +119,15 @@ def build_pruner(
 def checkpoint_sha256(config: PruneConfig) -> str | None:
     """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
 
-    The method cascade uses none as long as none is given and none is bundled.
-
     Raises
     ------
     CheckpointError
-        If the method corradaptor is asked for and there is no checkpoint, or the file cannot be read.
+        If the method needs a checkpoint and there is none, or the file cannot be read.
     """
     if config.method not in (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE):
         return None
-    from corrsfm.model import weights
     from corrsfm.prune.learned import sha256_of
 
-    if config.method is PruneMethod.CASCADE and config.model is None and weights.DEFAULT_CHECKPOINT is None:
-        return None
     return sha256_of(config.model)
 
 

@@ -1,4 +1,4 @@
-"""Robust estimation of two-view geometry: LO-RANSAC by COLMAP, MAGSAC++ by OpenCV, and how to compare models.
+"""Robust estimation of two-view geometry: LO-RANSAC by COLMAP, MAGSAC++ by OpenCV, and the errors to a model.
 
 A part of the prune stage. A camera whose focal length is only a guess never gets an essential matrix: the
 guess would be forced onto the estimate, so a fundamental matrix is estimated instead, as COLMAP does.
@@ -25,7 +25,6 @@ from corrsfm.types import Camera, Correspondences, TwoViewModel
 
 __all__ = [
     "TwoViewEstimate",
-    "best_model",
     "lo_ransac",
     "magsac",
     "msac_scores",
@@ -221,7 +220,7 @@ def _magsac_pair(
     return TwoViewEstimate(model=model, inlier_mask=inlier_mask)
 
 
-# --------------------------------------------------------------------------------------- comparing models
+# --------------------------------------------------------------------------------------- errors to a model
 
 
 def _calibration_matrix(camera: Camera) -> NDArray[np.float64]:
@@ -293,41 +292,3 @@ def msac_scores(errors_px: NDArray[np.float64], max_error_px: float) -> NDArray[
         ``1 − min(error² / max_error², 1)``; the sum over the matches is the MSAC score of the model.
     """
     return (1.0 - np.minimum((errors_px / max_error_px) ** 2, 1.0)).astype(np.float32)
-
-
-def best_model(
-    models: Sequence[TwoViewModel],
-    pair: Correspondences,
-    judges: NDArray[np.bool_],
-    *,
-    max_error_px: float,
-    margin: float = 0.0,
-) -> int | None:
-    """The model that explains most of a common set of matches.
-
-    Every hypothesis was estimated from another subset, on which it looks best; only a common set makes them
-    comparable.
-
-    Parameters
-    ----------
-    models : sequence of TwoViewModel
-        The most trusted first.
-    pair : Correspondences
-    judges : (M,) bool
-        The matches that vote.
-    max_error_px : float
-        Truncation of the MSAC score, pixels.
-    margin : float
-        How much more of the score, as a share, a model needs to replace one that is trusted more.
-
-    Returns
-    -------
-    int or None
-        Index of the winner; None without models.
-    """
-    best, best_score = None, 0.0
-    for index, model in enumerate(models):
-        score = float(msac_scores(sampson_errors_px(model, pair)[judges], max_error_px).sum(dtype=np.float64))
-        if best is None or score > (1.0 + margin) * best_score:
-            best, best_score = index, score
-    return best
