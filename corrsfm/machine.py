@@ -12,10 +12,9 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 from corrsfm import __version__
-from corrsfm.config import RunConfig
 from corrsfm.errors import ConfigError
 
-__all__ = ["device_of", "threaded", "threads_of", "use_threads", "versions"]
+__all__ = ["count_threads", "find_device", "threaded", "use_threads", "versions"]
 
 RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
 
@@ -23,31 +22,40 @@ K = TypeVar("K")
 R = TypeVar("R")
 
 
-def threads_of(run: RunConfig) -> int:
-    """Number of threads to use: the ones asked for, or all this process may have."""
-    if run.threads:
-        return run.threads
+def count_threads(wanted: int) -> int:
+    """Number of threads to use: as many as wanted, or for 0 all that this process may have."""
+    if wanted:
+        return wanted
     # Inside a batch job the machine has more cores than the job.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def device_of(run: RunConfig) -> str:
-    """Torch device to use.
+def find_device(name: str) -> str:
+    """Torch device that an option names.
+
+    Parameters
+    ----------
+    name : str
+        auto (CUDA if there is a GPU, else CPU), cpu, cuda or cuda:N.
 
     Raises
     ------
     ConfigError
-        If the device is not there.
+        If there is no such device.
     """
     import torch
 
-    if run.device == "auto":
+    if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        torch.zeros(1, device=run.device)
+        torch.zeros(1, device=name)
     except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"--device {run.device}: not available here; try --device auto or cpu") from error
-    return run.device
+        reason = str(error).splitlines()[0]
+        raise ConfigError(
+            f"--device {name}: torch {torch.__version__} cannot use it here ({reason}); "
+            "try auto, cpu, cuda or cuda:0"
+        ) from error
+    return name
 
 
 def use_threads(num_threads: int) -> None:

@@ -21,7 +21,7 @@ from corrsfm import config as cfg
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError, InputError, WorkspaceError
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
-from corrsfm.machine import device_of, threaded, threads_of, use_threads, versions
+from corrsfm.machine import count_threads, find_device, threaded, use_threads, versions
 from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
 from corrsfm.types import (
@@ -72,7 +72,7 @@ def index_photos(
     started = time.monotonic()
     cache = PhotoCache(workspace.photo_cache)
     records, cameras = index_images(
-        images_dir, config, threads=threads_of(run), hash_of=cache.hash_of, info_of=cache.info_of
+        images_dir, config, threads=count_threads(run.threads), hash_of=cache.hash_of, info_of=cache.info_of
     )
     cache.save()
     check_hloc_keys(record.name for record in records)
@@ -127,7 +127,7 @@ def extract_features(
             return error
 
     def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
-        for name, result in threaded(work, missing, threads_of(run)):
+        for name, result in threaded(work, missing, count_threads(run.threads)):
             if isinstance(result, Features):
                 yield name, result
             elif images.config.get("skip_unreadable"):
@@ -198,15 +198,17 @@ def match_pairs(
     pairs = workspace.require("pairs")
     store = ItemStore(workspace.features, FEATURES)
     wanted = _wanted_matches(workspace)
-    device = device_of(run)
+    device = find_device(run.device)
     # On a CPU a thread takes a pair: threads that share a pair wait for each other at every step.
     on_cpu = device == "cpu"
-    use_threads(1 if on_cpu else threads_of(run))
+    use_threads(1 if on_cpu else count_threads(run.threads))
     with store.reader() as read:
         matcher = Matcher(lambda name: read(name).descriptors, device=device, block_size=config.block_size)
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, Matches]]:
-            return threaded(lambda pair: matcher.match(*pair), missing, threads_of(run) if on_cpu else 1)
+            return threaded(
+                lambda pair: matcher.match(*pair), missing, count_threads(run.threads) if on_cpu else 1
+            )
 
         return complete(
             workspace,
@@ -236,12 +238,14 @@ def prune_matches(
         raise WorkspaceError(
             f"{workspace.matches}: older than the features; run: corrsfm match {workspace.root}"
         )
-    pruner = build_pruner(config, device=device_of(run), seed=run.seed, threads=threads_of(run))
+    pruner = build_pruner(
+        config, device=find_device(run.device), seed=run.seed, threads=count_threads(run.threads)
+    )
     wanted = {
         pair: config_hash("prune", fingerprint, pruner.fingerprint, cameras[pair[0]], cameras[pair[1]])
         for pair, fingerprint in match_fingerprints.items()
     }
-    use_threads(threads_of(run))
+    use_threads(count_threads(run.threads))
     with ItemStore(workspace.features, FEATURES).reader() as load, putative.reader() as read_matches:
         read_features = functools.lru_cache(maxsize=CACHED_IMAGES)(load)
 
@@ -301,7 +305,7 @@ def verify_matches(
             pruned=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
             config=config,
             seed=run.seed,
-            num_threads=threads_of(run),
+            num_threads=count_threads(run.threads),
             log_file=workspace.log,
         )
     outcome = StageOutcome(
@@ -344,7 +348,7 @@ def reconstruct(
             workspace.sparse,
             config=config,
             seed=run.seed,
-            num_threads=threads_of(run),
+            num_threads=count_threads(run.threads),
             log_file=workspace.log,
             on_progress=on_progress,
         )

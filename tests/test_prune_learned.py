@@ -7,11 +7,10 @@ import torch
 from two_view_pairs import make_pair
 
 from corrsfm.config import OperatingPoint, Precision, PruneConfig, PruneMethod
-from corrsfm.errors import CheckpointError, ConfigError, CorrsfmError
+from corrsfm.errors import CheckpointError, CorrsfmError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.prune import Pruner, build_pruner
 from corrsfm.prune.learned import (
-    choose_device,
     choose_precision,
     pack_batches,
     score_matches,
@@ -240,15 +239,6 @@ def test_auto_precision_never_chooses_emulation(monkeypatch):
     monkeypatch.setattr(torch.cpu, "_is_avx512_bf16_supported", lambda: True)
     assert choose_precision(Precision.AUTO, device, 128) is torch.bfloat16
     assert choose_precision(Precision.AUTO, device, 32) is torch.float32
-
-
-def test_unknown_device_is_an_error():
-    with pytest.raises(ConfigError, match="unknown device 'tpu9x'"):
-        choose_device("tpu9x")
-    if not torch.cuda.is_available():
-        with pytest.raises(ConfigError, match="no such GPU"):
-            choose_device("cuda:0")
-        assert choose_device("auto") == torch.device("cpu")
 
 
 def test_checkpoint_is_loaded_by_the_builder_and_named_in_the_fingerprint(network, tmp_path):

@@ -76,10 +76,11 @@ def bench(
     from corrsfm.benchmark import format_rows, run_benchmark
     from corrsfm.cli.evaluate import command_line
     from corrsfm.evaluation.records import provenance, save_results
-    from corrsfm.machine import device_of, threads_of, use_threads
+    from corrsfm.machine import count_threads, find_device, use_threads
 
-    use_threads(threads_of(run))
-    devices = sorted({"cpu", device_of(run)}) if run.device == "auto" else [device_of(run)]
+    use_threads(count_threads(run.threads))
+    device = find_device(run.device)
+    devices = sorted({"cpu", device}) if run.device == "auto" else [device]
     rows = run_benchmark(
         model=model,
         devices=devices,
@@ -96,7 +97,10 @@ def bench(
             "bench",
             {
                 "provenance": provenance(seed=run.seed, command=command_line(), device=devices[-1]),
-                "subject": {"model": str(model or "the published architecture"), "threads": threads_of(run)},
+                "subject": {
+                    "model": str(model or "the published architecture"),
+                    "threads": count_threads(run.threads),
+                },
                 "rows": [dataclasses.asdict(row) for row in rows],
             },
         )

@@ -39,10 +39,10 @@ def command_line() -> str:
 
 
 def _device(run: RunConfig) -> str:
-    from corrsfm.machine import device_of, threads_of, use_threads
+    from corrsfm.machine import count_threads, find_device, use_threads
 
-    use_threads(threads_of(run))
-    return device_of(run)
+    use_threads(count_threads(run.threads))
+    return find_device(run.device)
 
 
 def _method_bar(name: str, total: int) -> Callable[[int], None]:

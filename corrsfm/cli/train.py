@@ -66,13 +66,11 @@ def prepare(
 @click.option("--threads", default=0, show_default=True, help="Threads to use; 0 for all cores.")
 def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
     """Train by a recipe, alone or on several GPUs under torchrun."""
-    from corrsfm.config import RunConfig
-    from corrsfm.machine import device_of, threads_of, use_threads
+    from corrsfm.machine import count_threads, find_device, use_threads
     from corrsfm.training.loop import train as train_by_recipe
 
-    options = RunConfig(device=device, threads=threads)
-    use_threads(threads_of(options))
-    path = train_by_recipe(recipe, device=device_of(options), resume=resume, on_log=_echo_row)
+    use_threads(count_threads(threads))
+    path = train_by_recipe(recipe, device=find_device(device), resume=resume, on_log=_echo_row)
     click.echo(str(path))
 
 

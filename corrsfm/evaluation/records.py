@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import re
 from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import InputError
-from corrsfm.machine import versions
+from corrsfm.machine import count_threads, versions
 from corrsfm.workspace import atomic_write_text
 
 __all__ = ["file_sha256", "kept_methods", "load_results", "provenance", "save_results"]
@@ -32,7 +31,7 @@ def provenance(*, seed: int, command: str = "", device: str = "cpu") -> dict[str
         "machine": {
             "system": f"{platform.system()} {platform.machine()}",
             "processor": _processor(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cores": count_threads(0),
             "device": _device_name(device),
         },
         "seed": seed,

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.config import OperatingPoint, Precision, RunConfig
-from corrsfm.errors import CheckpointError, ConfigError, CorrsfmError
-from corrsfm.machine import threads_of
+from corrsfm.config import OperatingPoint, Precision
+from corrsfm.errors import CheckpointError, CorrsfmError
+from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.robust import normalised_residuals
@@ -28,7 +28,6 @@ from corrsfm.types import Correspondences, PruneResult, TwoViewModel
 
 __all__ = [
     "Pruner",
-    "choose_device",
     "choose_precision",
     "pack_batches",
     "score_matches",
@@ -66,32 +65,6 @@ class NetworkEstimate(NamedTuple):
     """(M,) last logit of every match, −inf for those that the network did not see."""
     essential: NDArray[np.float64] | None
     """(3, 3) acts on normalised coordinates; None if too few matches were left to determine it."""
-
-
-def choose_device(name: str) -> torch.device:
-    """The device that an option names.
-
-    Parameters
-    ----------
-    name : str
-        auto (CUDA if there is one, else CPU), cpu, cuda or cuda:N.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such device.
-    """
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ConfigError(f"unknown device '{name}'; try auto, cpu, cuda or cuda:0") from error
-    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
-        raise ConfigError(
-            f"device '{name}': torch {torch.__version__} sees no such GPU here; try --device cpu"
-        )
-    return device
 
 
 def choose_precision(precision: Precision, device: torch.device, channels: int) -> torch.dtype:
@@ -260,9 +233,9 @@ class Pruner:
         batched: bool | None = None,
         compile: bool = False,
     ) -> None:
-        self.device = choose_device(device)
+        self.device = torch.device(find_device(device))
         self.dtype = choose_precision(precision, self.device, network.head.linear1.in_features)
-        self._num_threads = threads_of(RunConfig(threads=threads))
+        self._num_threads = count_threads(threads)
         self._batched = self.device.type != "cpu" if batched is None else batched
         self._side_channels = network.side_channels
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)

@@ -1,0 +1,48 @@
+"""What this process runs on."""
+
+import os
+import threading
+
+import pytest
+import torch
+
+from corrsfm.errors import ConfigError
+from corrsfm.machine import count_threads, find_device, threaded, versions
+
+
+def test_devices_that_exist_keep_their_name() -> None:
+    assert find_device("cpu") == "cpu"
+    assert find_device("auto") == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+@pytest.mark.parametrize("name", ["tpu9x", "cuda:77", ""])
+def test_a_device_that_is_not_there_is_an_error_that_names_it(name: str) -> None:
+    with pytest.raises(ConfigError, match=rf"--device {name}: torch .* cannot use it here \(.+try auto, cpu"):
+        find_device(name)
+
+
+def test_zero_threads_means_all_that_the_process_may_have() -> None:
+    assert count_threads(3) == 3
+    assert 1 <= count_threads(0) <= (os.cpu_count() or 1)
+
+
+def test_threaded_work_comes_back_in_order_and_is_not_far_ahead() -> None:
+    started = []
+    first_may_end = threading.Event()
+
+    def work(key: int) -> int:
+        started.append(key)
+        if key == 0:
+            first_may_end.wait(5)
+        return key * key
+
+    results = threaded(work, range(100), 2)
+    threading.Timer(0.05, first_may_end.set).start()
+    assert next(results) == (0, 0)
+    assert max(started) < 4
+    assert list(results) == [(key, key * key) for key in range(1, 100)]
+
+
+def test_versions_name_what_is_installed_and_nothing_else() -> None:
+    found = versions(["numpy", "no-such-package-here"])
+    assert list(found) == ["corrsfm", "python", "numpy"]
