@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import signal
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -27,6 +28,11 @@ __all__ = [
     "read_models",
     "summarise_model",
 ]
+
+# Importing pycolmap makes SIGTERM print a stack trace of native code, as if something had crashed; this gives
+# the signal back the meaning that it had. Only the main thread may.
+with contextlib.suppress(ValueError):
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 _SILENT = 3
 _SMALLEST_DISK_BYTES = 1 << 20
