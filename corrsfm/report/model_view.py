@@ -167,7 +167,7 @@ def plotly_view(view: ModelView) -> str:
                 "xaxis": hidden,
                 "yaxis": hidden,
                 "zaxis": hidden,
-                "camera": {"eye": {"x": 0.2, "y": -1.25, "z": 0.6}},
+                "camera": {"eye": {"x": 0.25, "y": -1.55, "z": 0.75}},
                 "dragmode": "orbit",
             },
             "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
