@@ -37,10 +37,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import InputError
+from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
 from corrsfm.oanet import OANetPair, pinhole_parameters
 from corrsfm.types import Camera
-from corrsfm.workspace import atomic_path
 
 __all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
 

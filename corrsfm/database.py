@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from corrsfm.colmap import colmap_log, database_errors, is_sqlite
 from corrsfm.config import DatabaseConfig
 from corrsfm.errors import DatabaseError, InputError
+from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord, Pair, VerifiedPair
-from corrsfm.workspace import atomic_path
 
 __all__ = ["DatabaseSummary", "read_verified_pairs", "verify_database", "write_database"]
 

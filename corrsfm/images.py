@@ -6,7 +6,6 @@ mask and keypoints must speak of the same frame.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import unicodedata
@@ -28,13 +27,13 @@ from corrsfm.cameras import (
 )
 from corrsfm.config import ImagesConfig
 from corrsfm.errors import ImageError, InputError
+from corrsfm.files import sha256_of
 from corrsfm.types import Camera, ImageRecord
 
 __all__ = [
     "IMAGE_SUFFIXES",
     "camera_from_pycolmap",
     "duplicate_images",
-    "hash_file",
     "index_images",
     "list_images",
     "name_remarks",
@@ -68,7 +67,8 @@ def index_images(
     threads : int
         Photos whose headers are read at a time.
     hash_of, info_of : callable, optional
-        Stand-ins for `hash_file` and `read_photo_info`, for a caller that remembers their results.
+        Stand-ins for `corrsfm.files.sha256_of` and `read_photo_info`, for a caller that remembers their
+        results.
 
     Returns
     -------
@@ -84,13 +84,14 @@ def index_images(
     InputError
         If there are fewer than two photos, or the list, the masks or the cameras do not fit them.
     """
-    hash_of = hash_of or hash_file
+    hash_of = hash_of or sha256_of
     info_of = info_of or read_photo_info
     names = list_images(folder, image_list=config.image_list)
 
     def read(name: str) -> tuple[str, PhotoInfo] | ImageError:
         try:
-            return hash_of(folder / name), info_of(folder / name)
+            info = info_of(folder / name)
+            return hash_of(folder / name), info
         except ImageError as error:
             return error
 
@@ -219,15 +220,6 @@ def name_remarks(names: Sequence[str]) -> list[str]:
             groups[key(name)].append(name)
         remarks.extend(f"{text}: {', '.join(group)}" for group in groups.values() if len(group) > 1)
     return remarks
-
-
-def hash_file(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file's bytes."""
-    try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def _find_masks(mask_dir: Path | None, names: Sequence[str]) -> list[str | None]:

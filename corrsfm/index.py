@@ -15,9 +15,10 @@ from typing import Any
 
 from corrsfm.cameras import PhotoInfo
 from corrsfm.errors import WorkspaceError
-from corrsfm.images import hash_file, read_photo_info
+from corrsfm.files import atomic_write_json, atomic_write_text, sha256_of
+from corrsfm.images import read_photo_info
 from corrsfm.types import Camera, ImageRecord, PairList
-from corrsfm.workspace import Workspace, atomic_write_json, atomic_write_text
+from corrsfm.workspace import Workspace
 
 __all__ = ["Index", "PhotoCache", "read_index", "read_pairs", "write_index", "write_pairs"]
 
@@ -66,8 +67,8 @@ class PhotoCache:
             self._known = {}
 
     def hash_of(self, path: Path) -> str:
-        """As `corrsfm.images.hash_file`."""
-        return self._value(path, "sha256", hash_file)
+        """As `corrsfm.files.sha256_of`."""
+        return self._value(path, "sha256", sha256_of)
 
     def info_of(self, path: Path) -> PhotoInfo:
         """As `corrsfm.images.read_photo_info`."""
@@ -75,7 +76,11 @@ class PhotoCache:
         return PhotoInfo(**_tuples(values, "gps"))
 
     def _value(self, path: Path, key: str, compute: Callable[[Path], Any]) -> Any:
-        name, stat = str(path), path.stat()
+        try:
+            stat = path.stat()
+        except OSError:  # a broken link; what reads it says so
+            return compute(path)
+        name = str(path)
         stamp = [stat.st_size, stat.st_mtime_ns]
         known = self._known.get(name)
         entry = self._kept.setdefault(name, known if known and known["stamp"] == stamp else {"stamp": stamp})

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import InputError
+from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Correspondences
-from corrsfm.workspace import atomic_path
 
 __all__ = [
     "OANetPair",

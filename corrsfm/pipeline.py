@@ -20,6 +20,7 @@ from tqdm import tqdm
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError, InputError, WorkspaceError
+from corrsfm.files import atomic_write_json, sha256_of
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
 from corrsfm.machine import count_threads, find_device, threaded, use_threads, versions
 from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
@@ -33,7 +34,7 @@ from corrsfm.types import (
     PairList,
     PairStatistics,
 )
-from corrsfm.workspace import STAGE_COMMANDS, Workspace, atomic_write_json
+from corrsfm.workspace import STAGE_COMMANDS, Workspace
 
 __all__ = [
     "StageOutcome",
@@ -430,10 +431,8 @@ def _warn_if_disconnected(index: Index, pair_list: PairList) -> None:
 
 def _content(path: Path) -> str:
     """Hash of what a file or all files of a folder hold; missing ones are reported by whoever reads them."""
-    from corrsfm.images import hash_file
-
     files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
-    return config_hash(*[[file.name, hash_file(file)] for file in files if file.is_file()])
+    return config_hash(*[[file.name, sha256_of(file)] for file in files if file.is_file()])
 
 
 def _wanted_matches(workspace: Workspace) -> dict[Pair, str]:

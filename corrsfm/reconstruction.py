@@ -14,8 +14,8 @@ import pycolmap
 from corrsfm.colmap import colmap_log, database_errors, summarise_model
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError
+from corrsfm.files import atomic_path
 from corrsfm.types import ModelSummary
-from corrsfm.workspace import atomic_path
 
 __all__ = ["reconstruct"]
 

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.files import atomic_path
 from corrsfm.types import Features, Matches, Pair, PruneResult, TwoViewModel
-from corrsfm.workspace import atomic_path
 
 __all__ = ["FEATURES", "MATCHES", "PRUNED", "ItemStore", "PrunedMatches", "check_hloc_keys"]
 

@@ -1,4 +1,4 @@
-"""A workspace: where every artefact lies, what is finished, and how files come into being whole.
+"""A workspace: where every artefact lies, and what is finished.
 
 ::
 
@@ -26,8 +26,6 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import os
-import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -35,6 +33,7 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import WorkspaceError
+from corrsfm.files import atomic_path, atomic_write_json, atomic_write_text
 
 __all__ = [
     "STAGE_COMMANDS",
@@ -56,64 +55,6 @@ STAGE_COMMANDS = {
     "models": "reconstruct {workspace}",
 }
 """The stages, in order, and the command that makes each."""
-
-
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a sibling path to write to; rename it to ``path`` on success, remove it on failure.
-
-    Works for files and folders. A leftover of a killed process is removed first.
-    """
-    temporary = path.with_name(f".{path.name}.partial")
-    _remove(temporary)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        yield temporary
-        if temporary.is_dir():
-            _replace_folder(temporary, path)
-        else:
-            with open(temporary, "rb") as written:
-                os.fsync(written.fileno())
-            os.replace(temporary, path)
-    finally:
-        _remove(temporary)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def _replace_folder(source: Path, target: Path) -> None:
-    """Put a folder in another's place; a kill in between leaves none, never a mixture."""
-    old = target.with_name(f".{target.name}.old")
-    _remove(old)
-    if target.exists():
-        os.replace(target, old)
-    os.replace(source, target)
-    _remove(old)
-
-
-def atomic_write_text(path: Path, text: str) -> None:
-    """Write a text file whole or not at all.
-
-    Raises
-    ------
-    WorkspaceError
-        If it cannot be written.
-    """
-    try:
-        with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be written ({error.strerror})") from error
-
-
-def atomic_write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all."""
-    atomic_write_text(path, json.dumps(value, indent=2, ensure_ascii=False, default=str) + "\n")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from corrsfm.config import ImagesConfig
 from corrsfm.errors import ImageError, InputError
+from corrsfm.files import sha256_of
 from corrsfm.images import (
     duplicate_images,
-    hash_file,
     index_images,
     list_images,
     name_remarks,
@@ -207,7 +207,7 @@ def test_the_index_holds_every_photo_with_its_hash_camera_and_position(tmp_path:
         ("b.jpg", 0, (-11.0, -20.0, 0.0)),
         ("c.png", 1, None),
     ]
-    assert [record.sha256 for record in records] == [hash_file(tmp_path / r.name) for r in records]
+    assert [record.sha256 for record in records] == [sha256_of(tmp_path / r.name) for r in records]
     assert [camera.has_prior_focal_length for camera in cameras] == [True, False]
 
 
@@ -230,7 +230,7 @@ def test_masks_belong_to_photos_by_name(folder: Path, tmp_path: Path) -> None:
         "sub/a.jpg": "sub/a.jpg.png",
         "sub/deep/Übung 1.TIFF": None,
     }
-    assert records[2].mask_sha256 == hash_file(tmp_path / "masks" / "sub" / "a.jpg.png")
+    assert records[2].mask_sha256 == sha256_of(tmp_path / "masks" / "sub" / "a.jpg.png")
     np.testing.assert_array_equal(read_mask(tmp_path / "masks" / "sub" / "a.jpg.png", (48, 64)), mask > 0)
 
 

@@ -19,7 +19,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from photos import write_photo, write_photos
 
 from corrsfm import config as cfg
-from corrsfm import images, index, pipeline
+from corrsfm import files, images, index, pipeline
 from corrsfm.errors import ImageError, WorkspaceError
 from corrsfm.index import read_index, read_pairs
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
@@ -88,14 +88,13 @@ def test_unchanged_photos_are_not_even_opened_again(
 ) -> None:
     run_front(workspace, photos)
     opened: list[str] = []
-    for function in ("hash_file", "read_photo_info"):
-        original = getattr(images, function)
+    for original in (files.sha256_of, images.read_photo_info):
 
         def spy(path: Path, original: Callable = original) -> object:
             opened.append(path.name)
             return original(path)
 
-        monkeypatch.setattr(index, function, spy)
+        monkeypatch.setattr(index, original.__name__, spy)
     write_photo(photos / "2.png", 85)
     before = read_index(workspace)
     pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
@@ -316,6 +315,14 @@ def test_same_input_gives_same_bytes(tmp_path: Path, photos: Path) -> None:
         values.append(contents(workspace))
     assert values[0] == values[1]
     assert any(np.frombuffer(value, np.int32).size for key, value in values[0].items() if key[:2] == "p ")  # type: ignore[arg-type]
+
+
+def test_a_broken_link_is_an_unreadable_photo(workspace: Workspace, photos: Path) -> None:
+    (photos / "4.png").symlink_to("nowhere.png")
+    with pytest.raises(ImageError, match=r"4\.png: cannot be read"):
+        pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    outcome = pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
+    assert outcome.num_items == 4
 
 
 def test_a_truncated_photo_is_left_out_on_request(workspace: Workspace, photos: Path) -> None:

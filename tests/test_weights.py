@@ -132,14 +132,9 @@ def test_checkpoint_that_would_run_code_is_refused(tmp_path):
 
 
 def test_missing_file_is_an_error_that_names_it(tmp_path):
-    with pytest.raises(CheckpointError, match=r"absent\.pt: no such checkpoint"):
-        load_network(tmp_path / "absent.pt")
-
-
-def test_without_a_bundled_checkpoint_the_error_says_what_to_do(monkeypatch):
-    monkeypatch.setattr(weights, "DEFAULT_CHECKPOINT", None)
-    with pytest.raises(CheckpointError, match="--model"):
-        load_network()
+    for use in (load_network, weights.checkpoint_sha256):
+        with pytest.raises(CheckpointError, match=r"absent\.pt: no such checkpoint"):
+            use(tmp_path / "absent.pt")
 
 
 def bundle(monkeypatch, path, sha256: str) -> None:
@@ -162,6 +157,13 @@ def test_bundled_checkpoint_loads_by_default_and_by_name(monkeypatch, checkpoint
     assert load_network().config == load_network("test").config == CONFIG
 
 
+def test_hash_of_a_checkpoint_is_that_of_its_file_or_of_its_release(monkeypatch, checkpoint):
+    expected = hashlib.sha256(checkpoint.read_bytes()).hexdigest()
+    assert weights.checkpoint_sha256(checkpoint) == expected
+    bundle(monkeypatch, checkpoint, expected)
+    assert weights.checkpoint_sha256() == weights.checkpoint_sha256("test") == expected
+
+
 def test_bundled_checkpoint_with_another_hash_is_refused(monkeypatch, checkpoint):
     bundle(monkeypatch, checkpoint, "0" * 64)
     with pytest.raises(CheckpointError, match="SHA-256"):
@@ -169,7 +171,7 @@ def test_bundled_checkpoint_with_another_hash_is_refused(monkeypatch, checkpoint
 
 
 def test_every_registered_checkpoint_is_what_it_says():
-    assert weights.DEFAULT_CHECKPOINT is None or weights.DEFAULT_CHECKPOINT in weights.REGISTRY
+    assert weights.DEFAULT_CHECKPOINT in weights.REGISTRY
     for name, row in weights.REGISTRY.items():
         assert name == row.name
         assert load_network(name).config == row.config

@@ -1,4 +1,4 @@
-"""Workspaces: atomic files, records of stages, locks, and clear refusals."""
+"""Workspaces: records of stages, locks, and clear refusals."""
 
 import json
 import subprocess
@@ -8,40 +8,12 @@ from pathlib import Path
 import pytest
 
 from corrsfm.errors import WorkspaceError
-from corrsfm.workspace import StageRecord, Workspace, atomic_path, atomic_write_text
+from corrsfm.workspace import StageRecord, Workspace
 
 
 @pytest.fixture
 def workspace(tmp_path: Path) -> Workspace:
     return Workspace(tmp_path / "scene", create=True)
-
-
-def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
-    path = tmp_path / "a.txt"
-    atomic_write_text(path, "old")
-    with pytest.raises(RuntimeError), atomic_path(path) as temporary:
-        temporary.write_text("half")
-        raise RuntimeError
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_a_leftover_of_a_killed_writer_is_no_obstacle(tmp_path: Path) -> None:
-    (tmp_path / ".models.partial").mkdir()
-    (tmp_path / ".models.partial" / "junk").write_text("x")
-    with atomic_path(tmp_path / "models") as temporary:
-        temporary.mkdir()
-        (temporary / "new").write_text("y")
-    assert [path.name for path in (tmp_path / "models").iterdir()] == ["new"]
-
-
-def test_folders_replace_folders_whole(tmp_path: Path) -> None:
-    for content in ("one", "two"):
-        with atomic_path(tmp_path / "models") as temporary:
-            temporary.mkdir()
-            (temporary / content).touch()
-    assert [path.name for path in (tmp_path / "models").iterdir()] == ["two"]
-    assert [path.name for path in tmp_path.iterdir()] == ["models"]
 
 
 def test_records_survive_reopening(workspace: Workspace) -> None:

@@ -7,7 +7,6 @@ only what is new or changed.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import platform
 import re
@@ -15,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import InputError
+from corrsfm.files import atomic_write_text
 from corrsfm.machine import count_threads, versions
-from corrsfm.workspace import atomic_write_text
 
-__all__ = ["file_sha256", "kept_methods", "load_results", "provenance", "save_results"]
+__all__ = ["kept_methods", "load_results", "provenance", "save_results"]
 
 FORMAT_VERSION = 1
 _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap", "poselib", "torch", "h5py")
@@ -55,21 +54,6 @@ def _device_name(device: str) -> str:
     import torch
 
     return torch.cuda.get_device_name(device)
-
-
-def file_sha256(path: Path) -> str:
-    """Hex digest of a file's bytes, read in pieces.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read.
-    """
-    try:
-        with open(path, "rb") as handle:
-            return hashlib.file_digest(handle, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:

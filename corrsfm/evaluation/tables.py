@@ -13,7 +13,7 @@ from typing import Any
 
 from corrsfm.errors import InputError
 from corrsfm.evaluation.records import load_results
-from corrsfm.workspace import atomic_write_text
+from corrsfm.files import atomic_write_text
 
 __all__ = ["render_document", "render_table", "update_document"]
 

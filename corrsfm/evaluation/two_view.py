@@ -22,7 +22,8 @@ from corrsfm.evaluation.metrics import (
     pose_map,
     precision_recall_f,
 )
-from corrsfm.evaluation.records import file_sha256, kept_methods, provenance, save_results
+from corrsfm.evaluation.records import kept_methods, provenance, save_results
+from corrsfm.files import sha256_of
 from corrsfm.geometry import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_sq
 from corrsfm.oanet import OANetPair, is_oanet_file, read_pairs
 
@@ -257,7 +258,7 @@ def _load_subject(path: Path, max_per_scene: int | None, seed: int) -> _Subject:
     scenes = [pair.scene or path.stem for pair in pairs]
     description = {
         "name": path.name,
-        "sha256": file_sha256(path),
+        "sha256": sha256_of(path),
         "max_per_scene": max_per_scene,
         "selection_seed": seed,
         "num_pairs": len(pairs),

@@ -15,7 +15,6 @@ every loading.
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import pickle
 import re
 from collections.abc import Mapping
@@ -27,6 +26,7 @@ import torch
 from torch import Tensor
 
 from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
 
 __all__ = [
@@ -34,6 +34,7 @@ __all__ = [
     "FORMAT",
     "REGISTRY",
     "BundledCheckpoint",
+    "checkpoint_sha256",
     "from_published",
     "load_network",
     "read_provenance",
@@ -90,7 +91,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
 }
 """Bundled checkpoints by name."""
 
-DEFAULT_CHECKPOINT: str | None = "small-side"
+DEFAULT_CHECKPOINT = "small-side"
 """Name of the one that is loaded when none is asked for."""
 
 
@@ -108,11 +109,10 @@ def load_network(path: Path | str | None = None, *, map_location: str | torch.de
     ------
     CheckpointError
         If the file is missing, damaged, of another format or of another network; missing and unexpected keys
-        are listed. If nothing is bundled, or a bundled file is not the one that was released.
+        are listed. If a bundled file is not the one that was released.
     """
-    bundled = _find_bundled(path)
-    file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
-    content = _read(file, map_location, expected_sha256=bundled.sha256 if bundled else None)
+    file, released_sha256 = _locate(path)
+    content = _read(file, map_location, expected_sha256=released_sha256)
     if content.get("format") == FORMAT:
         config, state = _read_config(content.get("config"), file), content.get("state_dict")
     elif "format" in content:
@@ -169,48 +169,50 @@ def save_network(
         "state_dict": state,
         "provenance": dict(provenance or {}),
     }
-    path = Path(path)
-    unfinished = path.with_name(path.name + ".tmp")
-    torch.save(content, unfinished)
-    unfinished.replace(path)
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with atomic_path(Path(path)) as unfinished:
+        torch.save(content, unfinished)
+    return sha256_of(Path(path))
 
 
 def read_provenance(path: Path | str | None = None) -> dict[str, Any]:
     """Where the weights of a corrsfm checkpoint come from; empty for one in the published format."""
-    bundled = _find_bundled(path)
+    file, released_sha256 = _locate(path)
+    return dict(_read(file, "cpu", expected_sha256=released_sha256).get("provenance", {}))
+
+
+def checkpoint_sha256(path: Path | str | None = None) -> str:
+    """Hash of a checkpoint, given as for `load_network`.
+
+    Raises
+    ------
+    CheckpointError
+        If there is no such checkpoint.
+    """
+    file, released_sha256 = _locate(path)
+    return released_sha256 or sha256_of(file)
+
+
+def _locate(path: Path | str | None) -> tuple[Path, str | None]:
+    """File of a checkpoint, and the hash that it was released with if it is a bundled one."""
+    bundled = REGISTRY.get(str(path or DEFAULT_CHECKPOINT))
     file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
-    return dict(_read(file, "cpu", expected_sha256=bundled.sha256 if bundled else None).get("provenance", {}))
-
-
-def _find_bundled(path: Path | str | None) -> BundledCheckpoint | None:
-    if path is None:
-        if DEFAULT_CHECKPOINT is None:
-            raise CheckpointError(
-                "no network checkpoint comes with this version of corrsfm; "
-                "give one with --model, or choose a --method that needs none, such as 'loransac'"
-            )
-        return REGISTRY[DEFAULT_CHECKPOINT]
-    return REGISTRY.get(str(path))
+    if not file.is_file():
+        names = ", ".join(REGISTRY)
+        raise CheckpointError(
+            f"{file}: no such checkpoint; expected a file or the name of a bundled one ({names})"
+        )
+    return file, bundled.sha256 if bundled else None
 
 
 def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str | None) -> dict[str, Any]:
     """The dictionary in a checkpoint file."""
-    if not file.is_file():
-        names = ", ".join(REGISTRY) or "none"
+    if expected_sha256 is not None and (found := sha256_of(file)) != expected_sha256:
         raise CheckpointError(
-            f"{file}: no such checkpoint; expected a file or the name of a bundled one ({names})"
+            f"{file}: SHA-256 is {found}, expected {expected_sha256}; the file is damaged: reinstall corrsfm"
         )
-    if expected_sha256 is not None:
-        found = hashlib.sha256(file.read_bytes()).hexdigest()
-        if found != expected_sha256:
-            raise CheckpointError(
-                f"{file}: SHA-256 is {found}, expected {expected_sha256}; "
-                "the file is damaged: reinstall corrsfm"
-            )
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except (pickle.UnpicklingError, OSError, RuntimeError, EOFError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise CheckpointError(f"{file}: not a checkpoint that can be read safely ({reason})") from error
     if not isinstance(content, dict):

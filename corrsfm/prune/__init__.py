@@ -122,13 +122,13 @@ def checkpoint_sha256(config: PruneConfig) -> str | None:
     Raises
     ------
     CheckpointError
-        If the method needs a checkpoint and there is none, or the file cannot be read.
+        If there is no such checkpoint.
     """
     if config.method not in (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE):
         return None
-    from corrsfm.prune.learned import sha256_of
+    from corrsfm.model import weights
 
-    return sha256_of(config.model)
+    return weights.checkpoint_sha256(config.model)
 
 
 def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Pruner:

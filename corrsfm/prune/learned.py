@@ -5,7 +5,6 @@ The only inference module that touches a device.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import OperatingPoint, Precision
-from corrsfm.errors import CheckpointError, CorrsfmError
+from corrsfm.errors import CorrsfmError
 from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
@@ -33,7 +32,6 @@ __all__ = [
     "score_matches",
     "select_candidates",
     "select_kept",
-    "sha256_of",
 ]
 
 logger = logging.getLogger(__name__)
@@ -270,7 +268,7 @@ class Pruner:
             If there is no usable checkpoint.
         """
         network = load_network(path)
-        return cls(network, checkpoint_sha256=sha256_of(path), device=device, **options)
+        return cls(network, checkpoint_sha256=weights.checkpoint_sha256(path), device=device, **options)
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
@@ -405,27 +403,6 @@ def _one_thread_an_operation() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def sha256_of(path: Path | None) -> str:
-    """Hash of a checkpoint: a file, the name of a bundled one, or None for the default one.
-
-    Raises
-    ------
-    CheckpointError
-        If the file cannot be read, or there is no default.
-    """
-    name = weights.DEFAULT_CHECKPOINT if path is None else str(path)
-    if name is None:
-        raise CheckpointError(
-            "no network checkpoint is bundled; give one with --model or choose --method loransac"
-        )
-    if name in weights.REGISTRY:
-        return weights.REGISTRY[name].sha256
-    try:
-        return hashlib.sha256(Path(name).read_bytes()).hexdigest()
-    except OSError as error:
-        raise CheckpointError(f"{name}: the checkpoint cannot be read ({error.strerror})") from error
 
 
 def _is_out_of_memory(error: RuntimeError) -> bool:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap import observation_errors
 from corrsfm.errors import DependencyError
+from corrsfm.files import atomic_write_text
 from corrsfm.report import charts, pictures
 from corrsfm.report.model_view import ModelView, make_view, plotly_view
 from corrsfm.report.scene import MissingImage, SceneReport
 from corrsfm.report.style import STYLE
 from corrsfm.report.table import statistics_rows
 from corrsfm.types import PairStatistics
-from corrsfm.workspace import atomic_write_text
 
 __all__ = ["LoadMatches", "write_html"]
 

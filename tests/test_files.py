@@ -1,0 +1,46 @@
+"""Files come into being whole, and are told apart by what they hold."""
+
+from pathlib import Path
+
+import pytest
+
+from corrsfm.errors import InputError
+from corrsfm.files import atomic_path, atomic_write_text, sha256_of
+
+
+def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    atomic_write_text(path, "old")
+    with pytest.raises(RuntimeError), atomic_path(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_leftover_of_a_killed_writer_is_no_obstacle(tmp_path: Path) -> None:
+    (tmp_path / ".models.partial").mkdir()
+    (tmp_path / ".models.partial" / "junk").write_text("x")
+    with atomic_path(tmp_path / "models") as temporary:
+        temporary.mkdir()
+        (temporary / "new").write_text("y")
+    assert [path.name for path in (tmp_path / "models").iterdir()] == ["new"]
+
+
+def test_folders_replace_folders_whole(tmp_path: Path) -> None:
+    for content in ("one", "two"):
+        with atomic_path(tmp_path / "models") as temporary:
+            temporary.mkdir()
+            (temporary / content).touch()
+    assert [path.name for path in (tmp_path / "models").iterdir()] == ["two"]
+    assert [path.name for path in tmp_path.iterdir()] == ["models"]
+
+
+def test_hash_is_the_published_one_of_known_bytes(tmp_path: Path) -> None:
+    (tmp_path / "abc").write_bytes(b"abc")
+    assert sha256_of(tmp_path / "abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+
+
+def test_file_without_a_hash_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="absent: cannot be read"):
+        sha256_of(tmp_path / "absent")
