@@ -10,13 +10,8 @@ from corrsfm.config import OperatingPoint, Precision, PruneConfig, PruneMethod
 from corrsfm.errors import CheckpointError, CorrsfmError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.prune import Pruner, build_pruner
-from corrsfm.prune.learned import (
-    choose_precision,
-    pack_batches,
-    score_matches,
-    select_candidates,
-    select_kept,
-)
+from corrsfm.prune.learned import choose_precision, pack_batches
+from corrsfm.prune.selection import select_candidates
 
 SMALL = NetworkConfig(
     channels=16, clusters=12, neighbors=(6, 3), fusion_rounds=1, motion_stacking=1, heads=2, side_channels=2
@@ -129,17 +124,6 @@ def test_other_errors_of_the_network_are_not_swallowed(network, monkeypatch):
         pruner([make(), make(1)])
 
 
-def test_candidates_are_the_finite_matches_of_best_ratio_in_order():
-    pair = make(num=6)
-    normalised = pair.normalised.copy()
-    normalised[1, 0] = np.nan
-    ratios = np.array([0.9, 0.1, 0.5, np.nan, 0.5, 0.2], np.float32)
-    pair = dataclasses.replace(pair, normalised=normalised, ratios=ratios)
-    assert select_candidates(pair, 6).tolist() == [0, 2, 3, 4, 5]
-    assert select_candidates(pair, 3).tolist() == [2, 4, 5]
-    assert select_candidates(pair, 2).tolist() == [2, 5]
-
-
 def test_matches_beyond_the_candidates_are_judged_by_the_same_matrix(network):
     pair = make(num=300, inlier_ratio=0.7)
     (result,) = pruner_of(network, max_candidates=100)([pair])
@@ -158,30 +142,6 @@ def test_matches_beyond_the_candidates_are_judged_by_the_same_matrix(network):
     (alone,) = pruner_of(network)([few])
     np.testing.assert_allclose(alone.scores, result.scores[rows], atol=1e-4)
     np.testing.assert_allclose(alone.residuals, result.residuals[rows], rtol=1e-2, atol=1e-7)
-
-
-def test_operating_points_keep_what_they_promise():
-    pair = make(num=100, inlier_ratio=1.0)
-    pair = dataclasses.replace(pair, mutual=np.arange(100) % 2 == 0)
-    scores = np.full(100, 0.2, np.float32)
-    scores[:30], scores[30:80] = 0.95, 0.4
-    assert np.flatnonzero(select_kept(pair, scores, OperatingPoint.POSE)).tolist() == list(range(30))
-    sfm = select_kept(pair, scores, OperatingPoint.SFM)
-    assert np.flatnonzero(sfm).tolist() == list(range(0, 80, 2))
-    # One confident mutual match less: the pair is doubtful, and only the confident ones stay.
-    scores[0] = 0.69
-    sfm = select_kept(pair, scores, OperatingPoint.SFM)
-    assert np.flatnonzero(sfm).tolist() == list(range(2, 30, 2))
-
-
-def test_unseen_matches_are_scored_by_a_matrix_as_far_as_it_is_trusted():
-    logits = np.array([3.0, 3.0, 3.0, 3.0, -3.0, -np.inf, -np.inf], np.float32)
-    residuals = np.array([0, 0, 0, 1, 0, 0, 1], np.float32)
-    scores = score_matches(logits, residuals)
-    np.testing.assert_allclose(scores[:5], 1 / (1 + np.exp([-3.0, -3, -3, -3, 3])), rtol=1e-6)
-    np.testing.assert_allclose(scores[5:], [0.75, 0.0], atol=1e-7)
-    nothing = score_matches(np.full(3, -np.inf, np.float32), np.full(3, np.inf, np.float32))
-    np.testing.assert_array_equal(nothing, 0)
 
 
 @pytest.mark.parametrize("num", [0, 1, 8, 10, 40])

@@ -7,10 +7,12 @@
     ├── correspondences.py   putative matches as methods see them, shared with training
     ├── robust.py            LO-RANSAC, MAGSAC++ and the errors to a model
     ├── classical.py         none, ratio, loransac, magsac
+    ├── selection.py         what the network sees, and what is kept of it
     ├── learned.py           corradaptor: owns device, batches and memory
     └── cascade.py           the ratio test where it is enough, the network elsewhere
 
-Modules of this folder import each other downwards in the order robust < classical < learned < cascade.
+Modules of this folder import each other downwards in the order robust < classical < selection <
+learned < cascade.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Prune method ``corradaptor``: numpy in, numpy out around the network; owns device, batches and memory.
-
-The only inference module that touches a device.
-"""
+"""Prune method ``corradaptor``: numpy in, numpy out around the network; owns device, batches and memory."""
 
 from __future__ import annotations
 
@@ -23,30 +20,15 @@ from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.robust import normalised_residuals
+from corrsfm.prune.selection import score_matches, select_candidates, select_kept
 from corrsfm.types import Correspondences, PruneResult, TwoViewModel
 
-__all__ = [
-    "Pruner",
-    "choose_precision",
-    "pack_batches",
-    "score_matches",
-    "select_candidates",
-    "select_kept",
-]
+__all__ = ["Pruner", "choose_precision", "pack_batches"]
 
 logger = logging.getLogger(__name__)
 
 # The weighted eight-point algorithm sees what two prunings leave; of fewer it makes an arbitrary matrix.
 _MIN_NUM_FOR_MATRIX = 8
-
-# Scores from which on a match is kept, see `select_kept`.
-POSE_MIN_SCORE = 0.5
-SFM_MIN_SCORE = 0.3
-CONFIDENT_SCORE = 0.7
-MIN_NUM_CONFIDENT = 15
-
-# Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
-MAX_RESIDUAL = 1e-4
 
 MIN_BFLOAT16_CHANNELS = 64
 
@@ -86,27 +68,6 @@ def choose_precision(precision: Precision, device: torch.device, channels: int) 
     return torch.bfloat16 if native else torch.float32
 
 
-def select_candidates(pair: Correspondences, max_candidates: int) -> NDArray[np.intp]:
-    """The matches that the network sees.
-
-    Parameters
-    ----------
-    pair : Correspondences
-    max_candidates : int
-
-    Returns
-    -------
-    (K,) int
-        Increasing indices of the at most ``max_candidates`` finite matches of smallest ratio; among equal
-        ratios the first ones.
-    """
-    usable = np.flatnonzero(np.isfinite(pair.normalised).all(axis=1))
-    if len(usable) <= max_candidates:
-        return usable
-    order = np.argsort(np.nan_to_num(pair.ratios[usable], nan=np.inf), kind="stable")
-    return np.sort(usable[order[:max_candidates]])
-
-
 def pack_batches(sizes: Sequence[int], max_batch_matches: int) -> list[list[int]]:
     """Group pairs so that little of a batch is padding and none is too large.
 
@@ -132,61 +93,6 @@ def pack_batches(sizes: Sequence[int], max_batch_matches: int) -> list[list[int]
     return batches
 
 
-def select_kept(
-    pair: Correspondences, scores: NDArray[np.float32], operating_point: OperatingPoint
-) -> NDArray[np.bool_]:
-    """The matches to keep at an operating point.
-
-    Scores decide, not the distance to the network's matrix: a robust estimator that follows makes a better
-    matrix from well-chosen matches than the weighted eight-point algorithm. The scores were chosen on 240
-    validation pairs with the bundled checkpoint, whose model card has the numbers.
-
-    Parameters
-    ----------
-    pair : Correspondences
-    scores : (M,) float32
-        Confidence of the network in each match, in [0, 1].
-    operating_point : OperatingPoint
-        ``pose``: score above 0.5. ``sfm``: mutual matches with a score above 0.3; of a pair with fewer than
-        15 above 0.7, which as a rule shows two places, only those. (Of 114 pairs of a validation scene that
-        share nothing, 110 passed COLMAP's verification without this.)
-
-    Returns
-    -------
-    (M,) bool
-    """
-    if operating_point is OperatingPoint.POSE:
-        return scores > POSE_MIN_SCORE
-    confident = pair.mutual & (scores > CONFIDENT_SCORE)
-    if np.count_nonzero(confident) < MIN_NUM_CONFIDENT:
-        return confident
-    return pair.mutual & (scores > SFM_MIN_SCORE)
-
-
-def score_matches(logits: NDArray[np.float32], residuals: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Confidence in every match, whether the network saw it or not.
-
-    Parameters
-    ----------
-    logits : (M,) float32
-        Last logit of each match; −inf for those that the network did not see.
-    residuals : (M,) float32
-        Squared distances to the network's matrix; infinite without one.
-
-    Returns
-    -------
-    (M,) float32
-        The logistic function of the logit. For an unseen match ``a · exp(−residual / 1e-4)``, where a is
-        the share of the probable matches that the matrix explains: what is known of its quality.
-    """
-    unseen = np.isneginf(logits)
-    with np.errstate(over="ignore"):  # of exp(∞), whose limit is right
-        scores = 1.0 / (1.0 + np.exp(-logits))
-    probable = scores > POSE_MIN_SCORE
-    agreement = float(np.mean(residuals[probable] < MAX_RESIDUAL)) if probable.any() else 0.0
-    return np.where(unseen, agreement * np.exp(-residuals / MAX_RESIDUAL), scores).astype(np.float32)
-
-
 class Pruner:
     """Prunes pairs of any sizes with a network.
 
@@ -199,7 +105,7 @@ class Pruner:
     device : str
         auto, cpu, cuda or cuda:N.
     operating_point : OperatingPoint
-        See `select_kept`.
+        See `corrsfm.prune.selection.select_kept`.
     max_candidates : int
         Matches of a pair that the network sees, smallest ratio first. Its essential matrix is verified on
         all putative matches.
@@ -274,8 +180,8 @@ class Pruner:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
 
         Scores are the network's probabilities that a match is right, from the last round that judged it;
-        see `score_matches` for matches that it did not see. Pairs with fewer than 32 matches (for the
-        published pruning ratio) get scores but no model.
+        see `corrsfm.prune.selection.score_matches` for matches that it did not see. Pairs with fewer than 32
+        matches (for the published pruning ratio) get scores but no model.
         """
         self._guard(pairs)
         candidates = [select_candidates(pair, self._max_candidates) for pair in pairs]
