@@ -1,6 +1,7 @@
 """The stages in order: each reads and writes files of a workspace and skips what is finished.
 
-Every function here takes a workspace and the options of its stage and returns a `StageOutcome`.
+Every function here takes a workspace and the options of its stage and returns a `StageOutcome`; `report`
+alone summarises what all of them did.
 """
 
 from __future__ import annotations
@@ -11,30 +12,21 @@ import time
 from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError, InputError, WorkspaceError
-from corrsfm.files import atomic_write_json, sha256_of
+from corrsfm.files import sha256_of
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
-from corrsfm.machine import count_threads, find_device, threaded, use_threads, versions
+from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
-from corrsfm.types import (
-    Correspondences,
-    Features,
-    ImageRecord,
-    Matches,
-    Pair,
-    PairList,
-    PairStatistics,
-)
-from corrsfm.workspace import STAGE_COMMANDS, Workspace
+from corrsfm.summary import report
+from corrsfm.types import Correspondences, Features, ImageRecord, Matches, Pair, PairList
+from corrsfm.workspace import Workspace
 
 __all__ = [
     "StageOutcome",
@@ -47,9 +39,6 @@ __all__ = [
     "report",
     "verify_matches",
 ]
-
-if TYPE_CHECKING:
-    from corrsfm.report import SceneReport
 
 logger = logging.getLogger("corrsfm")
 
@@ -356,69 +345,6 @@ def reconstruct(
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
-
-
-def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
-    """Gather the statistics of a workspace; write `report.json` and, if asked for, `report.html`.
-
-    Works without models too and then tells why there are none.
-    """
-    from corrsfm.colmap import read_models, summarise_model
-    from corrsfm.database import read_verified_pairs
-    from corrsfm.report import make_report
-    from corrsfm.report.page import write_html
-
-    index = read_index(workspace)
-    pairs = read_pairs(workspace).pairs
-    workspace.require("verified matches")
-    verified = {
-        (pair.name0, pair.name1): pair.num_inliers for pair in read_verified_pairs(workspace.database)
-    }
-    with ItemStore(workspace.pruned, PRUNED).reader() as read_pruned:
-        statistics = []
-        for pair in pairs:
-            pruned = read_pruned(pair)
-            statistics.append(
-                PairStatistics(
-                    name0=pair[0],
-                    name1=pair[1],
-                    num_putative=pruned.num_putative,
-                    num_pruned=len(pruned.indices),
-                    num_verified=verified.get((min(pair), max(pair)), 0),
-                )
-            )
-    models = read_models(workspace.sparse) if workspace.record_of("models") else []
-    records = {stage: workspace.record_of(stage) for stage in STAGE_COMMANDS}
-    summary = make_report(
-        scene=workspace.root.resolve().name,
-        image_names=index.names,
-        pairs=statistics,
-        models=[summarise_model(model) for model in models],
-        stage_seconds={stage: record.seconds for stage, record in records.items() if record},
-        configuration={stage: record.config for stage, record in records.items() if record},
-        versions=versions(),
-    )
-    atomic_write_json(workspace.report_json, summary.to_dict())
-    if html:
-        write_html(
-            summary,
-            workspace.report_html,
-            model=models[0] if models else None,
-            images_dir=workspace.images_dir,
-            load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
-        )
-    return summary
-
-
-def _points_of_matches(
-    workspace: Workspace, pair: Pair
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Putative matches of a pair as points in both photos, and which of them pruning kept."""
-    with ItemStore(workspace.features, FEATURES).reader() as read_features:
-        keypoints0, keypoints1 = (read_features(name).keypoints for name in pair)
-    indices = ItemStore(workspace.matches, MATCHES).read(pair).indices
-    kept = ItemStore(workspace.pruned, PRUNED).read(pair).indices
-    return keypoints0[indices[:, 0]], keypoints1[indices[:, 1]], np.isin(indices[:, 0], kept[:, 0])
 
 
 def _warn_if_disconnected(index: Index, pair_list: PairList) -> None:

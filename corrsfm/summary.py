@@ -1,0 +1,86 @@
+"""What a workspace holds, summarised in `report.json` and on the page `report.html`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.files import atomic_write_json
+from corrsfm.index import read_index, read_pairs
+from corrsfm.machine import versions
+from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
+from corrsfm.types import Pair, PairStatistics
+from corrsfm.workspace import STAGE_COMMANDS, Workspace
+
+if TYPE_CHECKING:
+    from corrsfm.report import SceneReport
+
+__all__ = ["report"]
+
+
+def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
+    """Gather the statistics of a workspace; write `report.json` and, if asked for, `report.html`.
+
+    Works without models too and then tells why there are none.
+    """
+    from corrsfm.colmap import read_models, summarise_model
+    from corrsfm.report import make_report
+    from corrsfm.report.page import write_html
+
+    workspace.require("verified matches")
+    models = read_models(workspace.sparse) if workspace.record_of("models") else []
+    records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}
+    summary = make_report(
+        scene=workspace.root.resolve().name,
+        image_names=read_index(workspace).names,
+        pairs=_pair_statistics(workspace),
+        models=[summarise_model(model) for model in models],
+        stage_seconds={stage: record.seconds for stage, record in records.items()},
+        configuration={stage: record.config for stage, record in records.items()},
+        versions=versions(),
+    )
+    atomic_write_json(workspace.report_json, summary.to_dict())
+    if html:
+        write_html(
+            summary,
+            workspace.report_html,
+            model=models[0] if models else None,
+            images_dir=workspace.images_dir,
+            load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
+        )
+    return summary
+
+
+def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:
+    from corrsfm.database import read_verified_pairs
+
+    verified = {
+        (pair.name0, pair.name1): pair.num_inliers for pair in read_verified_pairs(workspace.database)
+    }
+    statistics = []
+    with ItemStore(workspace.pruned, PRUNED).reader() as read_pruned:
+        for name0, name1 in read_pairs(workspace).pairs:
+            pruned = read_pruned((name0, name1))
+            statistics.append(
+                PairStatistics(
+                    name0=name0,
+                    name1=name1,
+                    num_putative=pruned.num_putative,
+                    num_pruned=len(pruned.indices),
+                    num_verified=verified.get((min(name0, name1), max(name0, name1)), 0),
+                )
+            )
+    return statistics
+
+
+def _points_of_matches(
+    workspace: Workspace, pair: Pair
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Putative matches of a pair as points in both photos, and which of them pruning kept."""
+    with ItemStore(workspace.features, FEATURES).reader() as read_features:
+        keypoints0, keypoints1 = (read_features(name).keypoints for name in pair)
+    indices = ItemStore(workspace.matches, MATCHES).read(pair).indices
+    kept = ItemStore(workspace.pruned, PRUNED).read(pair).indices
+    return keypoints0[indices[:, 0]], keypoints1[indices[:, 1]], np.isin(indices[:, 0], kept[:, 0])
