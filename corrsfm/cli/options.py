@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import json
 import typing
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -87,23 +87,45 @@ def pipeline_options(command: F) -> F:
     The command is called with ``config=PipelineConfig(...)``: the file's values, overridden by the flags that
     the user really typed.
     """
-    stages = {
-        entry.name: typing.cast(type, entry.default_factory)
-        for entry in dataclasses.fields(cfg.PipelineConfig)
-    }
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, pipeline: Path | None, **kwargs: Any) -> Any:
-        base = cfg.load_pipeline(pipeline) if pipeline else cfg.PipelineConfig()
-        overridden = {name: _override(getattr(base, name), kwargs) for name in stages}
-        return command(*args, config=cfg.PipelineConfig(**overridden), **kwargs)
-
     file_option = click.option(
         "--pipeline",
+        "file",
         type=click.Path(path_type=Path),
         help="Pipeline file in TOML; flags typed here override it.",
     )
-    return typing.cast(F, file_option(_with_flags(wrapped, stages.values())))
+    tables = [entry.name for entry in dataclasses.fields(cfg.PipelineConfig)]
+    return file_option(_overriding(command, "config", cfg.PipelineConfig(), cfg.load_pipeline, tables))
+
+
+def recipe_options(command: F) -> F:
+    """``--config FILE`` and a flag for every option of a training run.
+
+    The command is called with ``recipe=TrainRecipe(...)``: the file's values, overridden by the flags that
+    the user really typed.
+    """
+    from corrsfm.training.config import TrainRecipe, load_recipe
+
+    file_option = click.option(
+        "--config",
+        "file",
+        type=click.Path(path_type=Path),
+        help="Recipe in TOML (tables train, augment, synthetic, network); flags typed here override it.",
+    )
+    return file_option(_overriding(command, "recipe", TrainRecipe(), load_recipe, ["train"]))
+
+
+def _overriding(
+    command: F, keyword: str, default: Any, load: Callable[[Path], Any], tables: Sequence[str]
+) -> F:
+    """A command called with the config in its option ``file``, and flags that override some tables of it."""
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, file: Path | None, **kwargs: Any) -> Any:
+        base = load(file) if file else default
+        changed = {name: _override(getattr(base, name), kwargs) for name in tables}
+        return command(*args, **{keyword: dataclasses.replace(base, **changed)}, **kwargs)
+
+    return typing.cast(F, _with_flags(wrapped, [type(getattr(default, name)) for name in tables]))
 
 
 def _with_flags(command: Callable, configs: Collection[type]) -> Callable:
@@ -125,28 +147,6 @@ def _override(base: Any, values: dict[str, Any]) -> Any:
             given[entry.name] = value
     checked = cfg.from_dict(type(base), given, "command line")
     return dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
-
-
-def recipe_options(command: F) -> F:
-    """``--config FILE`` and a flag for every option of a training run.
-
-    The command is called with ``recipe=TrainRecipe(...)``: the file's values, overridden by the flags that
-    the user really typed.
-    """
-    from corrsfm.training.config import TrainConfig, TrainRecipe, load_recipe
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, config: Path | None, **kwargs: Any) -> Any:
-        base = load_recipe(config) if config else TrainRecipe()
-        recipe = dataclasses.replace(base, train=_override(base.train, kwargs))
-        return command(*args, recipe=recipe, **kwargs)
-
-    file_option = click.option(
-        "--config",
-        type=click.Path(path_type=Path),
-        help="Recipe in TOML (tables train, augment, synthetic, network); flags typed here override it.",
-    )
-    return typing.cast(F, file_option(_with_flags(wrapped, [TrainConfig])))
 
 
 def run_options(command: F) -> F:
