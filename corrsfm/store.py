@@ -9,17 +9,13 @@ Layout (hloc's, so that its tools read these files; differences are noted)
     1 − ratio and carry ``mutual0`` (N0,) bool; pruned ones carry the score of the prune method.
     Every group has the attribute ``fingerprint``; the root has ``format`` and ``version``.
 
-Crash safety
-    An HDF5 file that is killed while being written is lost as a whole. So finished items go to a SQLite
-    journal next to the file, one transaction each, and the HDF5 file is written in one go and renamed into
-    place when its stage is complete. A killed process loses at most the item in work.
+Finished items go to a journal next to the file (`corrsfm.journal`); the file itself is written in one go and
+renamed into place when its stage is complete.
 """
 
 from __future__ import annotations
 
 import hashlib
-import io
-import sqlite3
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -32,6 +28,7 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_path
+from corrsfm.journal import Journal
 from corrsfm.types import Features, Matches, Pair, PruneResult, TwoViewModel
 
 __all__ = ["FEATURES", "MATCHES", "PRUNED", "ItemStore", "PrunedMatches", "check_hloc_keys"]
@@ -232,8 +229,7 @@ class ItemStore(Generic[K, T]):
     def __init__(self, path: Path, kind: Kind[K, T]) -> None:
         self.path = path
         self.kind = kind
-        self.journal_path = path.with_suffix(path.suffix + ".journal")
-        self._journal: sqlite3.Connection | None = None
+        self.journal = Journal(path.with_suffix(path.suffix + ".journal"))
 
     # reading ------------------------------------------------------------------------------------------------
 
@@ -319,34 +315,13 @@ class ItemStore(Generic[K, T]):
                 for key, fingerprint in wanted.items():
                     if self.kind.group(key) in file and self._fingerprint(file, key) == fingerprint:
                         found.add(key)
-        if self.journal_path.exists():
-            rows = dict(self._connection().execute("SELECT key, fingerprint FROM items"))
-            found |= {
-                key for key, fingerprint in wanted.items() if rows.get(self.kind.group(key)) == fingerprint
-            }
+        waiting = self.journal.fingerprints()
+        found |= {
+            key for key, fingerprint in wanted.items() if waiting.get(self.kind.group(key)) == fingerprint
+        }
         return found
 
     # writing ------------------------------------------------------------------------------------------------
-
-    def _connection(self) -> sqlite3.Connection:
-        if self._journal is None:
-            try:
-                self._journal = self._open_journal()
-            except sqlite3.DatabaseError:
-                # A journal that cannot be read holds nothing worth more than starting it afresh.
-                self.discard_journal()
-                self._journal = self._open_journal()
-        return self._journal
-
-    def _open_journal(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self.journal_path, isolation_level=None)
-        # In WAL mode a killed process loses only the transaction in work.
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("PRAGMA synchronous=NORMAL")
-        connection.execute(
-            "CREATE TABLE IF NOT EXISTS items (key TEXT PRIMARY KEY, fingerprint TEXT, item BLOB)"
-        )
-        return connection
 
     def add(self, key: K, fingerprint: str, item: T) -> None:
         """Put an item into the journal; it is safe when this returns.
@@ -356,19 +331,7 @@ class ItemStore(Generic[K, T]):
         WorkspaceError
             If the disk is full or the journal cannot be written.
         """
-        arrays, attributes = self.kind.encode(item)
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays, **{f"@{name}": np.asarray(value) for name, value in attributes.items()})  # type: ignore[arg-type]
-        try:
-            self._connection().execute(
-                "INSERT OR REPLACE INTO items VALUES (?, ?, ?)",
-                (self.kind.group(key), fingerprint, buffer.getvalue()),
-            )
-        except sqlite3.OperationalError as error:
-            raise WorkspaceError(
-                f"{self.journal_path}: cannot be written ({error}); free some disk space and run again, "
-                "finished work is kept"
-            ) from error
+        self.journal.add(self.kind.group(key), fingerprint, *self.kind.encode(item))
 
     def commit(self, wanted: Mapping[K, str]) -> None:
         """Make the HDF5 file hold exactly the wanted items, from itself and the journal; all or nothing.
@@ -395,13 +358,9 @@ class ItemStore(Generic[K, T]):
         try:
             for key, fingerprint in wanted.items():
                 name = self.kind.group(key)
-                row = (
-                    self._connection()
-                    .execute("SELECT item FROM items WHERE key = ? AND fingerprint = ?", (name, fingerprint))
-                    .fetchone()
-                )
-                if row is not None:
-                    self._write_group(target, name, fingerprint, row[0])
+                item = self.journal.read(name, fingerprint)
+                if item is not None:
+                    self._write_group(target, name, fingerprint, *item)
                 elif source is not None and name in source and self._fingerprint(source, key) == fingerprint:
                     source.copy(source[name], target, name=name, shallow=False)
                 else:
@@ -411,25 +370,19 @@ class ItemStore(Generic[K, T]):
                 source.close()
 
     @staticmethod
-    def _write_group(target: h5py.File, name: str, fingerprint: str, blob: bytes) -> None:
+    def _write_group(
+        target: h5py.File, name: str, fingerprint: str, arrays: Arrays, attributes: Attributes
+    ) -> None:
         group = target.create_group(name)
         group.attrs["fingerprint"] = fingerprint
-        with np.load(io.BytesIO(blob), allow_pickle=False) as arrays:
-            for entry in arrays.files:
-                if entry.startswith("@"):
-                    value = arrays[entry].item()
-                    group.attrs[entry[1:]] = value
-                else:
-                    group.create_dataset(entry, data=arrays[entry])
+        group.attrs.update(attributes)
+        for entry, values in arrays.items():
+            group.create_dataset(entry, data=values)
 
     def discard_journal(self) -> None:
         """Forget everything that is only in the journal."""
-        self.close()
-        for suffix in ("", "-wal", "-shm"):
-            Path(f"{self.journal_path}{suffix}").unlink(missing_ok=True)
+        self.journal.discard()
 
     def close(self) -> None:
         """Close the journal; its items stay for the next run."""
-        if self._journal is not None:
-            self._journal.close()
-            self._journal = None
+        self.journal.close()

@@ -186,7 +186,7 @@ def test_killed_writer_loses_at_most_the_item_in_work(tmp_path: Path) -> None:
     process.start()
     store = ItemStore(path, FEATURES)
     wanted = {f"{number:05d}": "f" for number in range(10_000)}
-    while not (store.journal_path.exists() and len(store.finished(wanted)) > 20):
+    while not (store.journal.path.exists() and len(store.finished(wanted)) > 20):
         assert process.is_alive()
     assert process.pid is not None
     os.kill(process.pid, signal.SIGKILL)
@@ -206,7 +206,7 @@ def test_a_half_written_file_is_refused_with_what_to_do(store: ItemStore) -> Non
 
 
 def test_a_damaged_journal_is_started_afresh(store: ItemStore) -> None:
-    store.journal_path.write_bytes(b"not a database at all" * 100)
+    store.journal.path.write_bytes(b"not a database at all" * 100)
     store.add("a", "1", make_features())
     assert store.finished({"a": "1"}) == {"a"}
 
