@@ -1,6 +1,6 @@
 """Fixtures shared by all tests."""
 
-# cv2 must be loaded before pycolmap, see test_imports.py.
+# cv2 must be loaded before pycolmap, see test_architecture.py.
 import os
 from pathlib import Path
 

