@@ -73,11 +73,11 @@ class DependencyError(CorrsfmError):
     purpose : str
         What it is needed for, as the end of "… is needed for".
     extra : str
-        The extra of corrsfm that brings it.
+        The extra of corrsfm that brings it; empty if it is in none.
     """
 
-    def __init__(self, package: str, purpose: str, extra: str) -> None:
+    def __init__(self, package: str, purpose: str, extra: str = "") -> None:
+        wanted = f"'corrsfm[{extra}]'" if extra else package
         super().__init__(
-            f"the package '{package}' is needed for {purpose} and is not installed; "
-            f"try: pip install 'corrsfm[{extra}]'"
+            f"the package '{package}' is needed for {purpose} and is not installed; try: pip install {wanted}"
         )

@@ -1,7 +1,9 @@
 """Two-view methods: every filter and every estimator keeps one contract, and each does what its name says."""
 
+import dataclasses
 import sys
 
+import cv2
 import numpy as np
 import pytest
 from two_view_pairs import make_pair
@@ -13,7 +15,9 @@ from corrsfm.evaluation.methods import CLASSICAL_METHODS, parse_method
 from corrsfm.geometry import essential_from_pose, pose_error_deg
 from corrsfm.types import Camera, Correspondences, PruneResult, TwoViewModel
 
-FILTERS = ("nn", "mutual", "ratio0.8", "ratio0.8+mutual", "oracle", "none", "ratio", "loransac", "magsac")
+FILTERS = (
+    "nn", "mutual", "ratio0.8", "ratio0.8+mutual", "adalam", "oracle", "none", "ratio", "loransac", "magsac",
+)  # fmt: skip
 METHODS = sorted({f"{name}/w8pt" for name in FILTERS} | {f"ratio0.8+mutual/{name}" for name in ESTIMATORS})
 
 
@@ -48,6 +52,43 @@ def test_contract_of_two_view_methods(name: str):
     if again.pose is not None:
         for field in ("rotation", "translation", "inlier_mask"):
             np.testing.assert_array_equal(getattr(again.pose, field), getattr(outputs[3].pose, field))
+
+
+def smooth_pair(num: int):
+    """A pair as of a plane in front of the camera, half of whose matches go astray; and which do not."""
+    generator = np.random.default_rng(0)
+    pair = make_pair(seed=0, num=num)
+    right = np.arange(num) < num // 2
+    start = generator.uniform(-0.5, 0.5, (num, 2)) * [1.2, 0.9]
+    end = np.where(right[:, None], 0.9 * start + [0.02, -0.01], generator.uniform(-0.5, 0.5, (num, 2)))
+    return dataclasses.replace(
+        pair,
+        correspondences=np.hstack([start, end]).astype(np.float32),
+        ratios=np.where(right, 0.7, 0.9).astype(np.float32),
+        mutual=np.ones(num, bool),
+        log_scale_ratios=np.full(num, np.log(0.9), np.float32),
+        rotations=np.zeros(num, np.float32),
+    ), right
+
+
+@pytest.mark.parametrize(("name", "num"), [("adalam", 600), ("gms", 4000)])
+def test_neighbourhood_filters_keep_what_moves_together(name: str, num: int):
+    if name == "gms" and not hasattr(cv2, "xfeatures2d"):
+        pytest.skip("needs OpenCV with its contributed modules")
+    pair, right = smooth_pair(num)
+    broken = pair.correspondences.copy()
+    broken[::100] = np.nan
+    for points in (pair.correspondences, broken):
+        (result,) = parse_filter(name)([dataclasses.replace(pair, correspondences=points)])
+        assert result.inlier_mask[right].mean() > 0.9
+        assert result.inlier_mask[~right].mean() < 0.1
+    assert not result.inlier_mask[::100].any()
+
+
+def test_gms_without_the_contributed_modules_says_what_to_install(monkeypatch):
+    monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
+    with pytest.raises(DependencyError, match="pip install opencv-contrib-python-headless"):
+        parse_filter("gms")
 
 
 @pytest.mark.parametrize("estimator", sorted(ESTIMATORS))

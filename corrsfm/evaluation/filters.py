@@ -1,8 +1,6 @@
 """Filters of putative matches under one interface: what is kept before a pose is estimated.
 
-A filter is named by a short text, see `parse_filter`. GMS and AdaLAM are not among them: GMS is only in
-OpenCV's contributed modules, which the headless package leaves out, and no released package of AdaLAM is
-independent of a deep-matching framework. A class with ``name`` and ``__call__`` plugs either in.
+A filter is named by a short text, see `parse_filter`; a class that keeps the protocol plugs another one in.
 """
 
 from __future__ import annotations
@@ -131,8 +129,8 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
     Parameters
     ----------
     text : str
-        ``nn`` (all matches), ``mutual``, ``ratio0.8``, ``ratio0.8+mutual`` (any ratio), ``oracle`` (the
-        right matches), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
+        ``nn`` (all matches), ``mutual``, ``ratio0.8``, ``ratio0.8+mutual`` (any ratio), ``gms``, ``adalam``,
+        ``oracle`` (the right matches), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
     device, seed, threads
         For methods of `corrsfm prune`.
 
@@ -140,17 +138,24 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
     ------
     ConfigError
         If the name means nothing.
+    DependencyError
+        If the library that brings the filter is not installed.
     """
     if text == "oracle":
         return OracleFilter()
+    if text in ("gms", "adalam"):
+        # Here, not above: their libraries are optional.
+        from corrsfm.evaluation.neighbourhood import AdalamFilter, GmsFilter
+
+        return GmsFilter() if text == "gms" else AdalamFilter(seed=seed)
     if side := _SIDE.fullmatch(text):
         ratio = float(side["ratio"]) if side["ratio"] else None
         return SideFilter(max_ratio=ratio, mutual=text.endswith("mutual"))
     methods = [str(method) for method in PruneMethod]
     if not (match := _PRUNER.fullmatch(text)) or match["method"] not in methods:
         raise ConfigError(
-            f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, oracle, or "
-            f"METHOD[@POINT][:CHECKPOINT] with METHOD of {', '.join(methods)}"
+            f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, gms, "
+            f"adalam, oracle, or METHOD[@POINT][:CHECKPOINT] with METHOD of {', '.join(methods)}"
         )
     config = parse_prune_method(text, PruneConfig())
     return PrunerFilter(text, config, device=device, seed=seed, threads=threads)

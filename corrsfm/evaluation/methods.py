@@ -22,6 +22,7 @@ CLASSICAL_METHODS = (
     "ratio0.8/poselib",
     "ratio0.8+mutual/poselib",
     "ratio0.9+mutual/poselib",
+    "adalam/poselib",
     "ratio0.8+mutual/colmap",
     "ratio0.8+mutual/ransac",
     "ratio0.8+mutual/magsac",
@@ -30,7 +31,7 @@ CLASSICAL_METHODS = (
     "ratio0.8+mutual/degensac",
     "oracle/poselib",
 )
-"""What a learned filter has to be compared with, and the ceiling."""
+"""What a learned filter has to be compared with, and the ceiling; not ``gms``, which needs another OpenCV."""
 
 
 @dataclass(frozen=True, kw_only=True)

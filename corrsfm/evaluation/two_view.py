@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.compact import read_labelled_pairs
+from corrsfm.compact import is_compact, read_labelled_pairs
 from corrsfm.errors import ConfigError, InputError
 from corrsfm.evaluation.methods import MethodOutput, TwoViewMethod, parse_method
 from corrsfm.evaluation.metrics import (
@@ -25,7 +25,7 @@ from corrsfm.evaluation.metrics import (
 from corrsfm.evaluation.records import kept_methods, provenance, save_results
 from corrsfm.files import sha256_of
 from corrsfm.geometry import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_sq
-from corrsfm.oanet import OANetPair, is_oanet_file, read_pairs
+from corrsfm.oanet import OANetPair, read_pairs
 
 __all__ = [
     "POSE_THRESHOLDS_DEG",
@@ -63,10 +63,10 @@ def load_labelled_pairs(path: Path, *, max_per_scene: int | None = None, seed: i
     InputError
         If it is neither, or holds no pairs.
     """
-    if is_oanet_file(path):
-        pairs = list(read_pairs(path, max_per_scene=max_per_scene, seed=seed))
-    else:
+    if is_compact(path):
         pairs = list(read_labelled_pairs(path, num_per_scene=max_per_scene, seed=seed))
+    else:
+        pairs = list(read_pairs(path, max_per_scene=max_per_scene, seed=seed))
     if not pairs:
         raise InputError(f"{path}: holds no pairs; expected a file of: corrsfm train prepare")
     return pairs
