@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
-from corrsfm.oanet import OANetPair, pinhole_parameters
+from corrsfm.oanet import OANetPair, open_pairs, pinhole_parameters, select_per_scene
 from corrsfm.types import Camera
 
 __all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
@@ -125,17 +125,14 @@ class CompactScene:
             self.rotations[image1],
             self.translations[image1],
         )
-        true = np.hstack(
-            [
-                self.normalised(image0, undistorted=True)[index0],
-                self.normalised(image1, undistorted=True)[index1],
-            ]
-        )
-        known = np.hstack(
-            [
-                self.normalised(image0, undistorted=False)[index0],
-                self.normalised(image1, undistorted=False)[index1],
-            ]
+        true, known = (
+            np.hstack(
+                [
+                    self.normalised(image0, undistorted=undistorted)[index0],
+                    self.normalised(image1, undistorted=undistorted)[index1],
+                ]
+            )
+            for undistorted in (True, False)
         )
         key0, key1 = self.keypoint_offsets[image0] + index0, self.keypoint_offsets[image1] + index1
         turn = self.orientations[key1] - self.orientations[key0]
@@ -246,11 +243,8 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
 
 def is_compact(path: Path) -> bool:
     """Whether a file is a compact pair file of any version, rather than one in another HDF5 layout."""
-    try:
-        with h5py.File(path, "r") as file:
-            return bool(file.attrs.get("format") == _FORMAT)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as HDF5 ({error})") from error
+    with open_pairs(path) as file:
+        return bool(file.attrs.get("format") == _FORMAT)
 
 
 def read_scenes(path: Path) -> list[CompactScene]:
@@ -261,16 +255,12 @@ def read_scenes(path: Path) -> list[CompactScene]:
     InputError
         If the file is missing or of another format.
     """
-    try:
-        with h5py.File(path, "r") as file:
-            if file.attrs.get("format") != _FORMAT or file.attrs.get("version") != _VERSION:
-                raise InputError(
-                    f"{path}: not a compact pair file of version {_VERSION}; "
-                    "make one with: corrsfm train prepare"
-                )
-            return [_decode(name, file[name]) for name in sorted(file)]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as a compact pair file ({error})") from error
+    with open_pairs(path) as file:
+        if file.attrs.get("format") != _FORMAT or file.attrs.get("version") != _VERSION:
+            raise InputError(
+                f"{path}: not a compact pair file of version {_VERSION}; make one with: corrsfm train prepare"
+            )
+        return [_decode(name, file[name]) for name in sorted(file)]
 
 
 def read_labelled_pairs(
@@ -287,9 +277,8 @@ def read_labelled_pairs(
         Seed of the draw.
     """
     for scene in read_scenes(path):
-        order = np.arange(len(scene.pairs))
-        if num_per_scene is not None and num_per_scene < len(order):
-            rng = np.random.default_rng([seed, *scene.name.encode()])
-            order = np.sort(rng.choice(order, num_per_scene, replace=False))
-        for index in order:
-            yield scene.pair(int(index))
+        indices: Iterable[int] = range(len(scene.pairs))
+        if num_per_scene is not None:
+            indices = select_per_scene([scene.name] * len(scene.pairs), num_per_scene, seed)
+        for index in indices:
+            yield scene.pair(index)

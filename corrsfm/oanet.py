@@ -16,6 +16,7 @@ string ``scenes``.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,8 +31,7 @@ from corrsfm.types import Camera, Correspondences
 
 __all__ = [
     "OANetPair",
-    "count_pairs",
-    "is_oanet_file",
+    "open_pairs",
     "pinhole_parameters",
     "read_pairs",
     "select_per_scene",
@@ -142,37 +142,23 @@ def _to_pixels(camera: Camera, normalised: NDArray[np.float32]) -> NDArray[np.fl
     return (normalised * np.array([fx, fy]) + np.array([cx, cy])).astype(np.float32)
 
 
-def _open(path: Path) -> h5py.File:
+@contextmanager
+def open_pairs(path: Path) -> Iterator[h5py.File]:
+    """Open a file of labelled pairs of either layout for reading.
+
+    Raises
+    ------
+    InputError
+        If it cannot be opened, or not be read inside the block.
+    """
     try:
-        return h5py.File(path, "r")
+        with h5py.File(path, "r") as handle:
+            yield handle
     except OSError as error:
         raise InputError(
-            f"{path}: cannot be read as HDF5 ({error}); expected a file of labelled pairs in OANet's layout"
+            f"{path}: cannot be read as HDF5 ({error}); expected a file of labelled pairs, "
+            "made with: corrsfm train prepare"
         ) from error
-
-
-def count_pairs(path: Path) -> int:
-    """Number of pairs in a file.
-
-    Raises
-    ------
-    InputError
-        If it is not a file in OANet's layout.
-    """
-    with _open(path) as handle:
-        return len(_indices(handle, path))
-
-
-def is_oanet_file(path: Path) -> bool:
-    """Whether a file is in OANet's layout rather than in another HDF5 one.
-
-    Raises
-    ------
-    InputError
-        If it is no HDF5 file.
-    """
-    with _open(path) as handle:
-        return "xs" in handle
 
 
 def _indices(handle: h5py.File, path: Path) -> list[str]:
@@ -205,6 +191,10 @@ def _camera(handle: h5py.File, index: str, image: int) -> Camera:
     )
 
 
+def _scene(handle: h5py.File, index: str) -> str:
+    return handle["scenes"][index].asstr()[()] if "scenes" in handle and index in handle["scenes"] else ""
+
+
 def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
     points = np.asarray(handle["xs"][index], np.float32).reshape(-1, 4)
 
@@ -215,7 +205,6 @@ def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
         # Some published files keep two label distances per match; the epipolar one comes first.
         return values.reshape(len(points), -1)[:, 0] if len(points) else np.zeros(0, np.float32)
 
-    scene = handle["scenes"][index].asstr()[()] if "scenes" in handle and index in handle["scenes"] else ""
     try:
         return OANetPair(
             correspondences=points,
@@ -228,7 +217,7 @@ def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
             rotations=column("rotations").astype(np.float32),
             camera0=_camera(handle, index, 0),
             camera1=_camera(handle, index, 1),
-            scene=scene,
+            scene=_scene(handle, index),
             name=f"{path.name} pair {index}",
         )
     except (KeyError, ValueError) as error:
@@ -252,13 +241,10 @@ def read_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -
     InputError
         If the file or a pair cannot be read.
     """
-    with _open(path) as handle:
+    with open_pairs(path) as handle:
         indices = _indices(handle, path)
         if max_per_scene is not None:
-            scenes = [
-                handle["scenes"][i].asstr()[()] if "scenes" in handle and i in handle["scenes"] else ""
-                for i in indices
-            ]
+            scenes = [_scene(handle, index) for index in indices]
             indices = [indices[i] for i in select_per_scene(scenes, max_per_scene, seed)]
         for index in indices:
             yield _read_pair(handle, index, path)

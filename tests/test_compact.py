@@ -71,5 +71,5 @@ def test_drawing_pairs_of_a_scene_does_not_depend_on_other_scenes(written, tmp_p
 
 def test_a_file_of_another_kind_is_refused(tmp_path):
     (tmp_path / "text.h5").write_text("no")
-    with pytest.raises(InputError, match=r"text\.h5"):
+    with pytest.raises(InputError, match=r"text\.h5: cannot be read as HDF5 .*corrsfm train prepare"):
         read_scenes(tmp_path / "text.h5")
