@@ -21,7 +21,7 @@ from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord, Pair, VerifiedPair
 
-__all__ = ["DatabaseSummary", "read_verified_pairs", "verify_database", "write_database"]
+__all__ = ["DatabaseSummary", "read_verified_pairs", "write_database"]
 
 # Ctrl-C is obeyed between batches of pairs.
 _PAIRS_PER_BATCH = 100
@@ -86,7 +86,7 @@ def write_database(
     seed : int
         Seed of the robust estimation.
     num_threads : int
-        Threads of the verification; 0 for all cores.
+        Threads of the verification, on which results do not depend; 0 for all cores.
     log_file : Path, optional
         Where pycolmap's messages are appended.
 
@@ -121,41 +121,6 @@ def write_database(
                 num_inliers=sum(num_inliers),
             )
     return summary
-
-
-def verify_database(
-    path: Path,
-    *,
-    min_num_inliers: int,
-    max_error_px: float,
-    seed: int = 0,
-    num_threads: int = 0,
-    log_file: Path | None = None,
-) -> None:
-    """Estimate the two-view geometry of every pair with matches, dropping earlier estimates.
-
-    Parameters
-    ----------
-    path : Path
-        An existing database; changed in place, pair by pair.
-    min_num_inliers : int
-        Fewest matches a geometry must explain.
-    max_error_px : float
-        Inlier threshold in pixels.
-    seed, num_threads, log_file
-        As for `write_database`; results do not depend on the number of threads.
-
-    Raises
-    ------
-    DatabaseError
-        If there is no such database or it is in use.
-    """
-    if not path.exists():
-        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
-    with colmap_log(log_file), database_errors(path):
-        with pycolmap.Database.open(path) as database:
-            database.clear_two_view_geometries()
-        _verify(path, min_num_inliers, max_error_px, seed, num_threads)
 
 
 def _verify(path: Path, min_num_inliers: int, max_error_px: float, seed: int, num_threads: int) -> None:

@@ -18,13 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.cameras import (
-    PhotoInfo,
-    assign_cameras,
-    camera_from_pycolmap,
-    normalise_points,
-    to_pycolmap,
-)
+from corrsfm.cameras import PhotoInfo, assign_cameras
 from corrsfm.config import ImagesConfig
 from corrsfm.errors import ImageError, InputError
 from corrsfm.files import sha256_of
@@ -32,16 +26,13 @@ from corrsfm.types import Camera, ImageRecord
 
 __all__ = [
     "IMAGE_SUFFIXES",
-    "camera_from_pycolmap",
     "duplicate_images",
     "index_images",
     "list_images",
     "name_remarks",
-    "normalise_points",
     "read_image",
     "read_mask",
     "read_photo_info",
-    "to_pycolmap",
 ]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")

@@ -11,7 +11,7 @@ import pytest
 
 from corrsfm.colmap import colmap_log, database_errors
 from corrsfm.config import DatabaseConfig
-from corrsfm.database import DatabaseSummary, read_verified_pairs, verify_database, write_database
+from corrsfm.database import DatabaseSummary, read_verified_pairs, write_database
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.types import Camera, Features, ImageRecord, VerifiedPair
 
@@ -164,7 +164,7 @@ def test_wrong_matches_are_not_verified(tmp_path: Path) -> None:
 def test_fewest_inliers_decide_which_pairs_are_verified(tmp_path: Path) -> None:
     summary = write(tmp_path / "database.db", config=DatabaseConfig(min_num_inliers=21))
     assert summary.num_verified_pairs == 1
-    verify_database(tmp_path / "database.db", min_num_inliers=20, max_error_px=4.0)
+    write(tmp_path / "database.db", config=DatabaseConfig(min_num_inliers=20))
     assert [pair.num_inliers for pair in read_verified_pairs(tmp_path / "database.db")] == [60, 20]
 
 
@@ -381,8 +381,6 @@ def test_file_that_is_no_database_is_not_replaced(tmp_path: Path) -> None:
 def test_missing_database_is_an_error_that_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(DatabaseError, match="corrsfm prune"):
         read_verified_pairs(tmp_path / "database.db")
-    with pytest.raises(DatabaseError, match="corrsfm prune"):
-        verify_database(tmp_path / "database.db", min_num_inliers=15, max_error_px=4.0)
     assert files(tmp_path) == []
 
 
