@@ -40,6 +40,8 @@ __all__ = [
     "config_hash",
     "from_dict",
     "load_pipeline",
+    "option",
+    "to_dict",
 ]
 
 
@@ -301,17 +303,6 @@ def _expected(annotation: Any) -> str:
     return getattr(annotation, "__name__", str(annotation))
 
 
-def check_minimums(config: Any, prefix: str = "") -> list[str]:
-    """Texts naming every value of a config below its minimum."""
-    problems = []
-    for entry in dataclasses.fields(config):
-        minimum = entry.metadata.get("minimum")
-        value = getattr(config, entry.name)
-        if minimum is not None and value < minimum:
-            problems.append(f"{prefix}{entry.name} is {value}, expected at least {minimum}")
-    return problems
-
-
 def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:
     """Build a config from plain values.
 
@@ -354,8 +345,10 @@ def _build(cls: type[T], values: dict[str, Any], prefix: str, problems: list[str
             except (TypeError, ValueError):
                 problems.append(f"{prefix}{key} is {value!r}, expected {_expected(annotations[name])}")
     config = cls(**arguments)
-    if not prefix or cls is not PipelineConfig:
-        problems.extend(check_minimums(config, prefix))
+    for entry in dataclasses.fields(config):  # type: ignore[arg-type]
+        minimum, value = entry.metadata.get("minimum"), getattr(config, entry.name)
+        if minimum is not None and value < minimum:
+            problems.append(f"{prefix}{entry.name} is {value}, expected at least {minimum}")
     return config
 
 

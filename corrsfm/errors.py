@@ -18,6 +18,8 @@ its text and exits non-zero. A text names the file or the pair, what was expecte
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 __all__ = [
     "CheckpointError",
     "ConfigError",
@@ -28,7 +30,10 @@ __all__ = [
     "InputError",
     "ReconstructionError",
     "WorkspaceError",
+    "first_few",
 ]
+
+_MAX_NAMED = 5
 
 
 class CorrsfmError(Exception):
@@ -81,3 +86,10 @@ class DependencyError(CorrsfmError):
         super().__init__(
             f"the package '{package}' is needed for {purpose} and is not installed; try: pip install {wanted}"
         )
+
+
+def first_few(names: Iterable[str]) -> str:
+    """The first of many names, and how many more there are, for a text that must stay readable."""
+    names = list(names)
+    rest = len(names) - _MAX_NAMED
+    return ", ".join(names[:_MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")

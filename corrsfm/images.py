@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from corrsfm.cameras import PhotoInfo, assign_cameras
 from corrsfm.config import ImagesConfig
-from corrsfm.errors import ImageError, InputError
+from corrsfm.errors import ImageError, InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.types import Camera, ImageRecord
 
@@ -36,7 +36,6 @@ __all__ = [
 ]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-MAX_NAMED = 5
 
 logger = logging.getLogger("corrsfm")
 
@@ -152,7 +151,9 @@ def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
         where = str(image_list)
     unprintable = [name for name in names if not _is_utf8(name)]
     if unprintable:
-        raise InputError(f"{folder}: names are not valid UTF-8: {_some(map(repr, unprintable))}; rename them")
+        raise InputError(
+            f"{folder}: names are not valid UTF-8: {first_few(map(repr, unprintable))}; rename them"
+        )
     if len(names) < 2:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
         raise InputError(
@@ -186,10 +187,10 @@ def _read_image_list(image_list: Path, folder: Path) -> list[str]:
     names = sorted({PurePosixPath(entry).as_posix() for entry in entries})
     outside = [name for name in names if name.startswith("/") or ".." in PurePosixPath(name).parts]
     if outside:
-        raise InputError(f"{image_list}: names must be relative to {folder}: {_some(outside)}")
+        raise InputError(f"{image_list}: names must be relative to {folder}: {first_few(outside)}")
     missing = [name for name in names if not (folder / name).is_file()]
     if missing:
-        raise InputError(f"{image_list}: {len(missing)} photos are not in {folder}: {_some(missing)}")
+        raise InputError(f"{image_list}: {len(missing)} photos are not in {folder}: {first_few(missing)}")
     return names
 
 
@@ -200,16 +201,16 @@ def name_remarks(names: Sequence[str]) -> list[str]:
     if spaced:
         remarks.append(
             f"{len(spaced)} names contain spaces, which text files of COLMAP and hloc cannot hold:"
-            f" {_some(spaced)}"
+            f" {first_few(spaced)}"
         )
-    for text, key in (
-        ("hloc writes '/' as '-' and would mix up", lambda name: name.replace("/", "-")),
-        ("file systems that ignore case or accents' encoding would mix up", _folded),
-    ):
-        groups = defaultdict(list)
-        for name in names:
-            groups[key(name)].append(name)
-        remarks.extend(f"{text}: {', '.join(group)}" for group in groups.values() if len(group) > 1)
+    groups = defaultdict(list)
+    for name in names:
+        groups[unicodedata.normalize("NFC", name).casefold()].append(name)
+    remarks.extend(
+        f"file systems that ignore case or accents' encoding would mix up: {', '.join(group)}"
+        for group in groups.values()
+        if len(group) > 1
+    )
     return remarks
 
 
@@ -335,23 +336,12 @@ def read_photo_info(path: Path) -> PhotoInfo:
     )
 
 
-def _some(names: Iterable[str]) -> str:
-    """The first few of many names."""
-    names = list(names)
-    rest = len(names) - MAX_NAMED
-    return ", ".join(names[:MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")
-
-
 def _census(files: Sequence[str]) -> str:
     """What is in a folder instead of photos."""
     suffixes = Counter(PurePosixPath(name).suffix.lower() or "no suffix" for name in files)
     if not suffixes:
         return "no visible files at all"
-    return "only " + ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(MAX_NAMED))
-
-
-def _folded(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()
+    return "only " + ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(5))
 
 
 def _is_utf8(name: str) -> bool:

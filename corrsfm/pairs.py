@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.config import PairsConfig, PairStrategy
-from corrsfm.errors import ConfigError, InputError
+from corrsfm.errors import ConfigError, InputError, first_few
 from corrsfm.retrieval import global_vectors, most_similar
 from corrsfm.types import Features, ImageRecord, Pair, PairList
 
@@ -38,7 +38,7 @@ IndexPairs = set[tuple[int, int]]
 """Pairs of photo indices, the smaller first."""
 
 MAX_EXHAUSTIVE_PHOTOS = 200
-MAX_NAMED = 5
+MAX_NAMED_GROUPS = 5
 BLOCK_SIZE = 2048
 LOOP_CLOSURE = "loop-closure"
 # Semi-axes of the WGS84 ellipsoid.
@@ -98,9 +98,9 @@ def make_pairs(
             case PairStrategy.SPATIAL:
                 found = spatial_pairs(records, config.num_spatial, config.max_distance_m)
             case PairStrategy.FILE:
-                found = read_pairs_file(_needed(config.pairs_file, "pairs_file", strategy), names)
+                found = read_pairs_file(_needed(config.pairs_file, "--pairs-file", strategy), names)
             case _:
-                model = _needed(config.covisible_model, "covisible_model", strategy)
+                model = _needed(config.covisible_model, "--covisible-model", strategy)
                 found = covisible_pairs(model, names, config.num_covisible)
         proposals[str(strategy)] = found
     if loop_closure:
@@ -114,9 +114,9 @@ def _resolve(strategies: Sequence[PairStrategy], num_photos: int) -> list[PairSt
     return sorted({automatic if strategy == PairStrategy.AUTO else strategy for strategy in strategies})
 
 
-def _needed(path: Path | None, option: str, strategy: PairStrategy) -> Path:
+def _needed(path: Path | None, flag: str, strategy: PairStrategy) -> Path:
     if path is None:
-        raise ConfigError(f"--pairing {strategy} needs --{option.replace('_', '-')}")
+        raise ConfigError(f"--pairing {strategy} needs {flag}")
     return path
 
 
@@ -265,7 +265,8 @@ def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:
             pairs.add(pair)
     if problems:
         raise InputError(
-            f"{path}: {len(problems)} lines do not name two different photos of the scene: {_some(problems)};"
+            f"{path}: {len(problems)} lines do not name two different photos of the scene:"
+            f" {first_few(problems)};"
             ' names are relative to the image folder; part or quote names with spaces by tabs or "'
         )
     if not pairs:
@@ -367,18 +368,11 @@ def describe_components(names: Sequence[str], pairs: Iterable[Pair]) -> str:
     components = connected_components(names, pairs)
     if len(components) < 2:
         return ""
-    sizes = _some(str(len(group)) for group in components)
+    sizes = first_few(str(len(group)) for group in components)
     lines = [
         f"the pairs do not connect all photos: groups of {sizes} photos, which cannot become one model;"
         " a wider --pairing, or several combined, may connect them"
     ]
-    for group in components[1 : 1 + MAX_NAMED]:
-        lines.append(f"not connected to the largest group: {_some(group)}")
+    for group in components[1 : 1 + MAX_NAMED_GROUPS]:
+        lines.append(f"not connected to the largest group: {first_few(group)}")
     return "\n".join(lines)
-
-
-def _some(texts: Iterable[str]) -> str:
-    """The first few of many."""
-    texts = list(texts)
-    rest = len(texts) - MAX_NAMED
-    return ", ".join(texts[:MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from tqdm import tqdm
 
 from corrsfm import config as cfg
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import WorkspaceError, first_few
 from corrsfm.index import Index, read_index
 from corrsfm.store import ItemStore
 from corrsfm.workspace import StageRecord, Workspace
@@ -162,5 +162,5 @@ def explain_photos(workspace: Workspace, index: Index) -> None:
         ("changed", {name for name in now.keys() & before.keys() if now[name] != before[name]}),
     ):
         if names:
-            shown = ", ".join(sorted(names)[:5]) + (", …" if len(names) > 5 else "")
+            shown = first_few(sorted(names))
             logger.info("photos %s since the last run: %d (%s)", text, len(names), shown)

@@ -263,11 +263,7 @@ class ItemStore(Generic[K, T]):
         with self._open() as file:
 
             def read(key: K) -> T:
-                group = file.get(self.kind.group(key))
-                if group is None:
-                    raise WorkspaceError(
-                        f"{self.path}: holds nothing for {key}; run the step that makes it again"
-                    )
+                group = self._group(file, key)
                 arrays = {name: value[()] for name, value in group.items() if isinstance(value, h5py.Dataset)}
                 try:
                     return self.kind.decode(arrays, group.attrs)
@@ -294,10 +290,14 @@ class ItemStore(Generic[K, T]):
         with self._open() as file:
             return {key: self._fingerprint(file, key) for key in keys}
 
-    def _fingerprint(self, file: h5py.File, key: K) -> str:
+    def _group(self, file: h5py.File, key: K) -> h5py.Group:
         group = file.get(self.kind.group(key))
         if group is None:
             raise WorkspaceError(f"{self.path}: holds nothing for {key}; run the step that makes it again")
+        return group
+
+    def _fingerprint(self, file: h5py.File, key: K) -> str:
+        group = self._group(file, key)
         if "fingerprint" in group.attrs:
             return str(group.attrs["fingerprint"])
         digest = hashlib.sha256()

@@ -291,7 +291,7 @@ class PruneResult:
         num = len(self.scores)
         _check("scores", self.scores, (num,), np.float32)
         _check("inlier_mask", self.inlier_mask, (num,), np.bool_)
-        if len(self.residuals) != num:
+        if len(self.residuals) == 0:
             object.__setattr__(self, "residuals", np.full(num, np.nan, np.float32))
         _check("residuals", self.residuals, (num,), np.float32)
 

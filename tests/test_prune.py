@@ -8,7 +8,7 @@ from two_view_pairs import CAMERA, make_pair
 
 from corrsfm.config import Precision, PruneConfig, PruneMethod
 from corrsfm.prune import build_pruner, make_correspondences, side_information
-from corrsfm.types import Correspondences, Features, Matches
+from corrsfm.types import Correspondences, Features, Matches, PruneResult
 
 METHODS = ["none", "ratio", "loransac", "magsac", "corradaptor", "cascade"]
 
@@ -163,6 +163,13 @@ def test_importing_the_stage_loads_nothing_heavy():
     code = "import sys, corrsfm.prune; print([m for m in ('torch', 'pycolmap', 'cv2') if m in sys.modules])"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert out.strip() == "[]"
+
+
+def test_residuals_of_another_number_of_matches_are_refused():
+    with pytest.raises(ValueError, match="residuals: expected shape"):
+        PruneResult(
+            scores=np.zeros(3, np.float32), inlier_mask=np.zeros(3, bool), residuals=np.zeros(2, np.float32)
+        )
 
 
 # ------------------------------------------------------------------------------------- correspondences

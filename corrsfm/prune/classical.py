@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from corrsfm.prune import robust
 from corrsfm.types import Correspondences, PruneResult
 
-__all__ = ["EstimatorPruner", "KeepAll", "RatioPruner", "result_from_estimate", "select_ratio"]
+__all__ = ["EstimatorPruner", "KeepAll", "RatioPruner", "select_ratio"]
 
 
 def select_ratio(pair: Correspondences, max_ratio: float) -> NDArray[np.bool_]:
@@ -34,7 +34,7 @@ def _distinctiveness(pair: Correspondences) -> NDArray[np.float32]:
     return np.clip(1.0 - np.nan_to_num(pair.ratios, nan=1.0), 0.0, 1.0).astype(np.float32)
 
 
-def result_from_estimate(
+def _result_from_estimate(
     pair: Correspondences,
     candidates: NDArray[np.bool_],
     estimate: robust.TwoViewEstimate,
@@ -147,6 +147,6 @@ class EstimatorPruner:
             pairs, candidates, max_error_px=self._max_error_px, seed=self._seed, threads=self._threads
         )
         return [
-            result_from_estimate(pair, mask, estimate, self._max_error_px, self.name)
+            _result_from_estimate(pair, mask, estimate, self._max_error_px, self.name)
             for pair, mask, estimate in zip(pairs, candidates, estimates, strict=True)
         ]
