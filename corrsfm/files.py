@@ -1,4 +1,4 @@
-"""Files: how they come into being whole, and the hash of what they hold."""
+"""Files: how they come into being whole, the hash of what they hold, and lists that people write."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 
 from corrsfm.errors import InputError, WorkspaceError
 
-__all__ = ["atomic_path", "atomic_write_json", "atomic_write_text", "sha256_of"]
+__all__ = ["atomic_path", "atomic_write_json", "atomic_write_text", "read_lines", "sha256_of"]
 
 
 @contextlib.contextmanager
@@ -87,3 +87,17 @@ def sha256_of(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file that a person wrote, such as a list of photos.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or is not UTF-8 (with or without byte order mark).
+    """
+    try:
+        return path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from corrsfm.cameras import PhotoInfo, assign_cameras
 from corrsfm.config import ImagesConfig
 from corrsfm.errors import ImageError, InputError, first_few
-from corrsfm.files import sha256_of
+from corrsfm.files import read_lines, sha256_of
 from corrsfm.types import Camera, ImageRecord
 
 __all__ = [
@@ -179,10 +179,7 @@ def _visible_files(folder: Path) -> list[str]:
 
 
 def _read_image_list(image_list: Path, folder: Path) -> list[str]:
-    try:
-        lines = image_list.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{image_list}: cannot be read as UTF-8 text ({error})") from error
+    lines = read_lines(image_list)
     entries = [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
     names = sorted({PurePosixPath(entry).as_posix() for entry in entries})
     outside = [name for name in names if name.startswith("/") or ".." in PurePosixPath(name).parts]

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from corrsfm.config import PairsConfig, PairStrategy
 from corrsfm.errors import ConfigError, InputError, first_few
+from corrsfm.files import read_lines
 from corrsfm.retrieval import global_vectors, most_similar
 from corrsfm.types import Features, ImageRecord, Pair, PairList
 
@@ -248,14 +249,10 @@ def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:
     InputError
         If the file cannot be read, or listing every line that does not name two different known photos.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as UTF-8 text ({error})") from error
     position = {name: index for index, name in enumerate(names)}
     pairs: IndexPairs = set()
     problems = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         pair = _parse_pair(line, position)
