@@ -6,8 +6,12 @@ their stage is written in one go. A killed process loses at most the item in wor
 
 from __future__ import annotations
 
+import contextlib
 import io
+import logging
+import os
 import sqlite3
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,14 +23,22 @@ from corrsfm.errors import WorkspaceError
 
 __all__ = ["Journal"]
 
+logger = logging.getLogger("corrsfm")
+
+# SQLite keeps what is not yet in the file itself beside it.
+_SUFFIXES = ("", "-wal", "-shm")
+
 
 class Journal:
     """Items by key, each with a fingerprint; opened at first use.
 
+    Every method raises `WorkspaceError` if the file cannot be used as it is: the disk is full, another program
+    holds it, it may not be written. A damaged file is renamed to ``<name>.damaged`` with a warning, and what
+    it held counts as not done.
+
     Parameters
     ----------
     path : Path
-        A file that is no readable journal is started afresh: it holds nothing worth more than that.
     """
 
     def __init__(self, path: Path) -> None:
@@ -35,69 +47,73 @@ class Journal:
 
     def _connect(self) -> sqlite3.Connection:
         if self._connection is None:
-            try:
-                self._connection = self._open()
-            except sqlite3.DatabaseError:
-                self.discard()
-                self._connection = self._open()
+            self._connection = sqlite3.connect(self.path, isolation_level=None)
+            # In WAL mode a killed process loses only the transaction in work.
+            self._connection.execute("PRAGMA journal_mode=WAL")
+            self._connection.execute("PRAGMA synchronous=NORMAL")
+            self._connection.execute(
+                "CREATE TABLE IF NOT EXISTS items (key TEXT PRIMARY KEY, fingerprint TEXT, item BLOB)"
+            )
         return self._connection
 
-    def _open(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self.path, isolation_level=None)
-        # In WAL mode a killed process loses only the transaction in work.
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("PRAGMA synchronous=NORMAL")
-        connection.execute(
-            "CREATE TABLE IF NOT EXISTS items (key TEXT PRIMARY KEY, fingerprint TEXT, item BLOB)"
+    def _execute(self, statement: str, parameters: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+        """Rows that a statement gives; of a damaged file, those of a new one in its place."""
+        try:
+            try:
+                return self._connect().execute(statement, parameters).fetchall()
+            except sqlite3.OperationalError:
+                raise
+            except sqlite3.DatabaseError as error:
+                self._set_aside(error)
+                return self._connect().execute(statement, parameters).fetchall()
+        except sqlite3.OperationalError as error:
+            self.close()
+            raise WorkspaceError(f"{self.path}: {_remedy(error)}; finished work is kept") from error
+
+    def _set_aside(self, error: sqlite3.DatabaseError) -> None:
+        self.close()
+        aside = self.path.with_name(f"{self.path.name}.damaged")
+        for suffix in _SUFFIXES:
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(f"{self.path}{suffix}", f"{aside}{suffix}")
+        logger.warning(
+            "%s: damaged (%s); kept as %s, what it held is done again", self.path, error, aside.name
         )
-        return connection
 
     def add(
         self, key: str, fingerprint: str, arrays: Mapping[str, NDArray], attributes: Mapping[str, Any]
     ) -> None:
-        """Write an item; it is safe when this returns.
-
-        Raises
-        ------
-        WorkspaceError
-            If the disk is full or the file cannot be written.
-        """
+        """Write an item; it is safe when this returns."""
         buffer = io.BytesIO()
         np.savez(buffer, **arrays, **{f"@{name}": np.asarray(value) for name, value in attributes.items()})  # type: ignore[arg-type]
-        try:
-            self._connect().execute(
-                "INSERT OR REPLACE INTO items VALUES (?, ?, ?)", (key, fingerprint, buffer.getvalue())
-            )
-        except sqlite3.OperationalError as error:
-            raise WorkspaceError(
-                f"{self.path}: cannot be written ({error}); free some disk space and run again, "
-                "finished work is kept"
-            ) from error
+        self._execute("INSERT OR REPLACE INTO items VALUES (?, ?, ?)", (key, fingerprint, buffer.getvalue()))
 
     def fingerprints(self) -> dict[str, str]:
         """Key → fingerprint of every item; empty without a file."""
         if not self.path.exists():
             return {}
-        return dict(self._connect().execute("SELECT key, fingerprint FROM items"))
+        return {key: fingerprint for key, fingerprint in self._execute("SELECT key, fingerprint FROM items")}
 
     def read(self, key: str, fingerprint: str) -> tuple[dict[str, NDArray], dict[str, Any]] | None:
         """Arrays and attributes of the item with that key and fingerprint; None if there is none."""
-        row = (
-            self._connect()
-            .execute("SELECT item FROM items WHERE key = ? AND fingerprint = ?", (key, fingerprint))
-            .fetchone()
-        )
-        if row is None:
+        rows = self._execute("SELECT item FROM items WHERE key = ? AND fingerprint = ?", (key, fingerprint))
+        if not rows:
             return None
-        with np.load(io.BytesIO(row[0]), allow_pickle=False) as stored:
-            values = dict(stored)
+        try:
+            with np.load(io.BytesIO(rows[0][0]), allow_pickle=False) as stored:
+                values = dict(stored)
+        except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            # SQLite has no checksum of what it holds, the archive of an item has.
+            self._execute("DELETE FROM items WHERE key = ?", (key,))
+            logger.warning("%s: %s is damaged (%s) and not used", self.path, key, error)
+            return None
         arrays = {name: value for name, value in values.items() if not name.startswith("@")}
         return arrays, {name[1:]: value.item() for name, value in values.items() if name.startswith("@")}
 
     def discard(self) -> None:
         """Delete the file and all items."""
         self.close()
-        for suffix in ("", "-wal", "-shm"):
+        for suffix in _SUFFIXES:
             Path(f"{self.path}{suffix}").unlink(missing_ok=True)
 
     def close(self) -> None:
@@ -105,3 +121,12 @@ class Journal:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
+
+
+def _remedy(error: sqlite3.OperationalError) -> str:
+    name = getattr(error, "sqlite_errorname", "")
+    if name.startswith(("SQLITE_BUSY", "SQLITE_LOCKED")):
+        return f"is in use by another program ({error}); close it there and run again"
+    if name.startswith(("SQLITE_READONLY", "SQLITE_PERM", "SQLITE_CANTOPEN")):
+        return f"cannot be written ({error}); check the permissions of the file and its folder and run again"
+    return f"cannot be written ({error}); free some disk space and run again"
