@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.files import atomic_write_text
 from corrsfm.index import read_pairs
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
 from corrsfm.types import Pair
-from corrsfm.workspace import Workspace, atomic_write_text
+from corrsfm.workspace import Workspace
 
 __all__ = ["write_page"]
 

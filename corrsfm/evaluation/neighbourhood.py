@@ -72,7 +72,9 @@ class GmsFilter:
             for points, size in zip((pair.points0, pair.points1), sizes, strict=True)
         ]
         matches = [cv2.DMatch(index, index, 0.0) for index in range(len(rows))]
-        kept = vars(cv2)["xfeatures2d"].matchGMS(*sizes, *keypoints, matches, withRotation=True, withScale=True)
+        kept = vars(cv2)["xfeatures2d"].matchGMS(
+            *sizes, *keypoints, matches, withRotation=True, withScale=True
+        )
         keep[rows[[match.queryIdx for match in kept]]] = True
         return keep
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from corrsfm.errors import CheckpointError
-from corrsfm.workspace import atomic_path
+from corrsfm.files import atomic_path
 
 __all__ = ["Average", "load_state", "save_state"]
 
