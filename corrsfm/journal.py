@@ -32,9 +32,9 @@ _SUFFIXES = ("", "-wal", "-shm")
 class Journal:
     """Items by key, each with a fingerprint; opened at first use.
 
-    Every method raises `WorkspaceError` if the file cannot be used as it is: the disk is full, another program
-    holds it, it may not be written. A damaged file is renamed to ``<name>.damaged`` with a warning, and what
-    it held counts as not done.
+    Every method raises `WorkspaceError` if the file cannot be used as it is: the disk is full, another
+    program holds it, it may not be written. A damaged file is renamed to ``<name>.damaged`` with a warning,
+    and what it held counts as not done.
 
     Parameters
     ----------

@@ -98,7 +98,9 @@ def complete(
                 store.add(key, wanted[key], item)
                 bar.update()
         workspace.forget(stage)
-        store.commit(wanted)
+        store.commit(
+            wanted, lambda keys: tqdm(keys, desc=f"writing {store.path.name}", unit=unit, leave=False)
+        )
     finally:
         store.close()
     outcome = StageOutcome(

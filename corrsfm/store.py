@@ -15,9 +15,10 @@ renamed into place when its stage is complete.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -110,7 +111,7 @@ def _decode_features(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -
     """Ours or hloc's: what hloc does not write gets a neutral value."""
     keypoints = np.asarray(arrays["keypoints"], np.float32) + HALF_PIXEL
     num = len(keypoints)
-    descriptors = np.asarray(arrays["descriptors"], np.float32).T
+    descriptors = _sift_descriptors(np.asarray(arrays["descriptors"], np.float32).T, num)
     width, height = (int(value) for value in np.asarray(arrays["image_size"]))
 
     def vector(name: str, default: float) -> NDArray[np.float32]:
@@ -121,9 +122,25 @@ def _decode_features(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -
         scales=vector("scales", 1.0),
         orientations=vector("oris", 0.0),
         scores=vector("scores", 1.0),
-        descriptors=np.clip(np.rint(descriptors * 512), 0, 255).astype(np.uint8),
+        descriptors=descriptors,
         image_size=(width, height),
     )
+
+
+def _sift_descriptors(descriptors: NDArray[np.float32], num: int) -> NDArray[np.uint8]:
+    """Stored descriptors (N, 128) as bytes; raises `ValueError` if they cannot be SIFT's."""
+    if descriptors.shape != (num, 128):
+        raise ValueError(
+            f"descriptors of shape {descriptors.shape[::-1]}, expected (128, {num}): only SIFT can be matched"
+        )
+    # Also false for NaN.
+    if not ((descriptors >= 0) & (descriptors <= 1)).all():
+        raise ValueError(
+            f"descriptors from {descriptors.min():g} to {descriptors.max():g}, expected SIFT's, of length 1 "
+            "and so from 0 to 1"
+        )
+    # The few entries above one half are clipped, as COLMAP does.
+    return np.clip(np.rint(descriptors * 512), 0, 255).astype(np.uint8)
 
 
 def _scatter(num: int, indices: NDArray[np.int32], scores: NDArray[np.float32]) -> Arrays:
@@ -167,7 +184,11 @@ def _decode_matches(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) ->
 
 def _encode_pruned(pruned: PrunedMatches) -> tuple[Arrays, Attributes]:
     arrays = _scatter(_num_rows(pruned.indices), pruned.indices, pruned.scores)
-    attributes: Attributes = {"num_putative": pruned.num_putative, "decided_by": pruned.decided_by}
+    attributes: Attributes = {
+        "num_putative": pruned.num_putative,
+        "num_kept": len(pruned.indices),
+        "decided_by": pruned.decided_by,
+    }
     if pruned.model is not None:
         arrays["model"] = pruned.model.matrix
         attributes["model_kind"] = pruned.model.kind
@@ -216,6 +237,22 @@ def check_hloc_keys(names: Iterable[str]) -> None:
         seen[key] = name
 
 
+def _why_unreadable(error: OSError) -> str:
+    """What to tell of a file that HDF5 could not read, so that nobody deletes what is whole."""
+    if error.errno is None:
+        # What HDF5 itself says about the content: no signature, truncated, a wrong byte.
+        return f"not a readable HDF5 file ({error}); delete it and run again"
+    if "unable to lock" in str(error):
+        if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES):
+            cause = "in use by another program; close it there and run again"
+        else:
+            cause = "cannot be locked; run again"
+        return f"{cause}, on a file system without locks with HDF5_USE_FILE_LOCKING=FALSE in the environment"
+    if isinstance(error, PermissionError):
+        return "may not be read; check the permissions of the file and its folder"
+    return f"cannot be read ({error}); check the disk and run again"
+
+
 class ItemStore(Generic[K, T]):
     """Items of one kind in an HDF5 file, with a journal of those finished since it was written.
 
@@ -240,9 +277,7 @@ class ItemStore(Generic[K, T]):
         except FileNotFoundError as error:
             raise WorkspaceError(f"{self.path}: missing; run the step that makes it") from error
         except OSError as error:
-            raise WorkspaceError(
-                f"{self.path}: not a readable HDF5 file ({error}); delete it and run again"
-            ) from error
+            raise WorkspaceError(f"{self.path}: {_why_unreadable(error)}") from error
         with file:
             version = file.attrs.get("version", FORMAT_VERSION)
             if version != FORMAT_VERSION:
@@ -264,12 +299,20 @@ class ItemStore(Generic[K, T]):
 
             def read(key: K) -> T:
                 group = self._group(file, key)
-                arrays = {name: value[()] for name, value in group.items() if isinstance(value, h5py.Dataset)}
                 try:
-                    return self.kind.decode(arrays, group.attrs)
+                    return self.kind.decode(
+                        {name: value[()] for name, value in group.items() if isinstance(value, h5py.Dataset)},
+                        group.attrs,
+                    )
+                except OSError as error:
+                    raise WorkspaceError(f"{self.path}: {key}: {_why_unreadable(error)}") from error
                 except KeyError as error:
                     raise WorkspaceError(
-                        f"{self.path}: {key} lacks {error}; delete the file and run again"
+                        f"{self.path}: {key} lacks {error}; move the file away and run again"
+                    ) from error
+                except ValueError as error:
+                    raise WorkspaceError(
+                        f"{self.path}: {key}: {error}; move the file away and run again"
                     ) from error
 
             yield read
@@ -289,6 +332,18 @@ class ItemStore(Generic[K, T]):
         """
         with self._open() as file:
             return {key: self._fingerprint(file, key) for key in keys}
+
+    def attributes(self, keys: Iterable[K]) -> Iterator[tuple[K, Attributes]]:
+        """Attributes of items, read without their datasets.
+
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing or unreadable, or holds no such item.
+        """
+        with self._open() as file:
+            for key in keys:
+                yield key, dict(self._group(file, key).attrs)
 
     def _group(self, file: h5py.File, key: K) -> h5py.Group:
         group = file.get(self.kind.group(key))
@@ -333,8 +388,15 @@ class ItemStore(Generic[K, T]):
         """
         self.journal.add(self.kind.group(key), fingerprint, *self.kind.encode(item))
 
-    def commit(self, wanted: Mapping[K, str]) -> None:
+    def commit(self, wanted: Mapping[K, str], progress: Callable[[Iterable[K]], Iterable[K]] = iter) -> None:
         """Make the HDF5 file hold exactly the wanted items, from itself and the journal; all or nothing.
+
+        Parameters
+        ----------
+        wanted : mapping
+            Key → fingerprint.
+        progress : callable
+            The keys, passed on one by one as they are written; for a progress bar.
 
         Raises
         ------
@@ -345,19 +407,24 @@ class ItemStore(Generic[K, T]):
             with atomic_path(self.path) as temporary, h5py.File(temporary, "w") as target:
                 target.attrs["format"] = f"corrsfm-{self.kind.label}"
                 target.attrs["version"] = FORMAT_VERSION
-                self._fill(target, wanted)
-        except OSError as error:
+                self._fill(target, wanted, progress)
+        # HDF5 notices some failures of writing only when it closes the file, which is a RuntimeError.
+        except (OSError, RuntimeError) as error:
             raise WorkspaceError(
                 f"{self.path}: cannot be written ({error}); free some disk space and run again, "
                 "finished work is kept"
             ) from error
         self.discard_journal()
 
-    def _fill(self, target: h5py.File, wanted: Mapping[K, str]) -> None:
-        source = h5py.File(self.path, "r") if self.path.exists() else None
-        try:
-            for key, fingerprint in wanted.items():
-                name = self.kind.group(key)
+    def _fill(
+        self,
+        target: h5py.File,
+        wanted: Mapping[K, str],
+        progress: Callable[[Iterable[K]], Iterable[K]],
+    ) -> None:
+        with self._open() if self.path.exists() else nullcontext() as source:
+            for key in progress(wanted):
+                name, fingerprint = self.kind.group(key), wanted[key]
                 item = self.journal.read(name, fingerprint)
                 if item is not None:
                     self._write_group(target, name, fingerprint, *item)
@@ -365,9 +432,6 @@ class ItemStore(Generic[K, T]):
                     source.copy(source[name], target, name=name, shallow=False)
                 else:
                     raise WorkspaceError(f"{self.path}: {key} was never finished; run again")
-        finally:
-            if source is not None:
-                source.close()
 
     @staticmethod
     def _write_group(

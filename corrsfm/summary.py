@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from corrsfm.files import atomic_write_json
 from corrsfm.index import read_index, read_pairs
 from corrsfm.machine import versions
-from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
+from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches
 from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import STAGE_COMMANDS, Workspace
 
@@ -59,20 +59,22 @@ def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:
     verified = {
         (pair.name0, pair.name1): pair.num_inliers for pair in read_verified_pairs(workspace.database)
     }
-    statistics = []
-    with ItemStore(workspace.pruned, PRUNED).reader() as read_pruned:
-        for name0, name1 in read_pairs(workspace).pairs:
-            pruned = read_pruned((name0, name1))
-            statistics.append(
-                PairStatistics(
-                    name0=name0,
-                    name1=name1,
-                    num_putative=pruned.num_putative,
-                    num_pruned=len(pruned.indices),
-                    num_verified=verified.get((min(name0, name1), max(name0, name1)), 0),
-                )
-            )
-    return statistics
+    pruned = ItemStore(workspace.pruned, PRUNED)
+    return [
+        PairStatistics(
+            name0=name0,
+            name1=name1,
+            num_putative=int(counts["num_putative"]),
+            num_pruned=_num_kept(pruned, (name0, name1), counts),
+            num_verified=verified.get((min(name0, name1), max(name0, name1)), 0),
+        )
+        for (name0, name1), counts in pruned.attributes(read_pairs(workspace).pairs)
+    ]
+
+
+def _num_kept(store: ItemStore[Pair, PrunedMatches], pair: Pair, counts: dict[str, Any]) -> int:
+    # Files of the first days hold no count.
+    return int(counts["num_kept"]) if "num_kept" in counts else len(store.read(pair).indices)
 
 
 def _points_of_matches(

@@ -1,5 +1,7 @@
 """The HDF5 store: exact round trips, hloc's layout, and a journal that survives being killed."""
 
+import errno
+import fcntl
 import multiprocessing
 import os
 import signal
@@ -203,6 +205,87 @@ def test_a_half_written_file_is_refused_with_what_to_do(store: ItemStore) -> Non
     store.path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
     with pytest.raises(WorkspaceError, match="not a readable HDF5 file.*delete it"):
         store.read("a")
+
+
+def test_a_truncated_file_is_refused_with_what_to_do(store: ItemStore) -> None:
+    store.add("a", "1", make_features(1000))
+    store.commit({"a": "1"})
+    store.path.write_bytes(store.path.read_bytes()[:5000])
+    with pytest.raises(WorkspaceError, match="truncated file.*delete it"):
+        store.read("a")
+
+
+def test_a_file_that_another_program_holds_is_not_to_be_deleted(store: ItemStore) -> None:
+    store.add("a", "1", make_features())
+    store.commit({"a": "1"})
+    with open(store.path, "r+b") as handle:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        with pytest.raises(WorkspaceError, match="in use by another program") as caught:
+            store.read("a")
+    assert "delete" not in str(caught.value) and "HDF5_USE_FILE_LOCKING=FALSE" in str(caught.value)
+    assert store.read("a") is not None
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "check the permissions"),
+        (OSError(errno.ENOLCK, "unable to lock file"), "HDF5_USE_FILE_LOCKING=FALSE"),
+        (OSError(errno.EIO, "Input/output error"), "check the disk"),
+    ],
+)
+def test_a_file_that_cannot_be_opened_now_is_not_to_be_deleted(
+    store: ItemStore, monkeypatch: pytest.MonkeyPatch, error: OSError, text: str
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise error
+
+    monkeypatch.setattr(h5py, "File", refuse)
+    with pytest.raises(WorkspaceError, match=text) as caught:
+        store.read("a")
+    assert "delete" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("descriptors", "text"),
+    [
+        (np.full((256, 1), 0.1), r"a\.jpg: descriptors of shape \(256, 1\), expected \(128, 1\)"),
+        (np.full((128, 2), 0.1), r"shape \(128, 2\), expected \(128, 1\)"),
+        (np.full((128, 1), -0.1), "descriptors from -0.1 to -0.1, expected SIFT's"),
+        (np.full((128, 1), 12.0), "descriptors from 12 to 12"),
+        (np.full((128, 1), np.nan), "descriptors from nan to nan"),
+    ],
+)
+def test_descriptors_of_another_kind_are_refused(
+    store: ItemStore, descriptors: np.ndarray, text: str
+) -> None:
+    with h5py.File(store.path, "w") as file:
+        group = file.create_group("a.jpg")
+        group["keypoints"] = np.array([[10, 20]], np.float16)
+        group["descriptors"] = descriptors
+        group["image_size"] = np.array([64, 48])
+    with pytest.raises(WorkspaceError, match=text):
+        store.read("a.jpg")
+
+
+def test_counts_of_a_pair_are_read_without_its_matches(tmp_path: Path) -> None:
+    result = PruneResult(scores=np.zeros(3, np.float32), inlier_mask=np.array([True, False, True]))
+    store = ItemStore(tmp_path / "pruned.h5", PRUNED)
+    store.add(("a", "b"), "f", PrunedMatches.from_result(make_matches(), result))
+    store.commit({("a", "b"): "f"})
+    with h5py.File(store.path, "r+") as file:
+        del file["a/b/matches0"], file["a/b/matching_scores0"]
+    ((pair, counts),) = store.attributes([("a", "b")])
+    assert pair == ("a", "b")
+    assert (counts["num_putative"], counts["num_kept"]) == (3, 2)
+
+
+def test_commit_tells_its_progress(store: ItemStore) -> None:
+    seen: list[str] = []
+    for name in "abc":
+        store.add(name, "1", make_features())
+    store.commit(dict.fromkeys("abc", "1"), lambda keys: (seen.append(key) or key for key in keys))
+    assert seen == ["a", "b", "c"]
 
 
 def test_a_damaged_journal_is_started_afresh(store: ItemStore) -> None:
