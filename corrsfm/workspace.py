@@ -13,6 +13,7 @@
     ├── pruned.h5           pruned matches
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
+    ├── sparse.old/         models of earlier matches, put aside when mapping failed
     ├── report.json, report.html
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
@@ -24,14 +25,20 @@ its recorded fingerprint, a hash of its options and of the fingerprints of its i
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
+import logging
+import os
+import shlex
+import shutil
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from corrsfm import config as cfg
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import atomic_path, atomic_write_json, atomic_write_text
 
@@ -44,17 +51,34 @@ __all__ = [
     "atomic_write_text",
 ]
 
+logger = logging.getLogger("corrsfm")
+
 FORMAT_VERSION = 1
 STAGE_COMMANDS = {
-    "images": "extract IMAGES {workspace}",
-    "features": "extract IMAGES {workspace}",
-    "pairs": "pairs {workspace}",
-    "matches": "match {workspace}",
-    "pruned matches": "prune {workspace}",
-    "verified matches": "prune {workspace}",
-    "models": "reconstruct {workspace}",
+    "images": "extract",
+    "features": "extract",
+    "pairs": "pairs",
+    "matches": "match",
+    "pruned matches": "prune",
+    "verified matches": "prune",
+    "models": "reconstruct",
 }
 """The stages, in order, and the command that makes each."""
+
+_OPTIONS_OF_COMMAND: dict[str, dict[str, type]] = {
+    "extract": {
+        "images": cfg.ImagesConfig,
+        "features": cfg.FeaturesConfig,
+        "pairs": cfg.PairsConfig,
+        "matches": cfg.MatchesConfig,
+    },
+    "pairs": {"pairs": cfg.PairsConfig},
+    "match": {"matches": cfg.MatchesConfig},
+    "prune": {"pruned matches": cfg.PruneConfig, "verified matches": cfg.DatabaseConfig},
+    "reconstruct": {"models": cfg.ReconstructionConfig},
+}
+
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,8 +151,10 @@ class Workspace:
             )
         if self.root.exists() and not self.root.is_dir():
             raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")
+        # A workspace that lost its manifest still has what only corrsfm writes.
+        own = self.photo_cache.exists() or self.images_json.exists()
         foreign = [path.name for path in (self.database, self.sparse) if path.exists()]
-        if foreign:
+        if foreign and not own:
             raise WorkspaceError(
                 f"{self.root}: holds {' and '.join(foreign)} of another tool; choose an empty folder, "
                 "nothing was touched"
@@ -143,9 +169,14 @@ class Workspace:
         try:
             values = json.loads(self.manifest.read_text(encoding="utf-8"))
             version = values["format_version"]
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            if version == FORMAT_VERSION:
+                _check_manifest(values)
+        except PermissionError as error:
+            raise WorkspaceError(f"{self.manifest}: may not be read; check its permissions") from error
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise WorkspaceError(
-                f"{self.manifest}: damaged ({error}); delete it to start this workspace afresh"
+                f"{self.manifest}: damaged ({error!r}); delete this file alone and run the commands of the "
+                "workspace again, finished features and matches are kept"
             ) from error
         if version != FORMAT_VERSION:
             raise WorkspaceError(
@@ -161,16 +192,31 @@ class Workspace:
         Raises
         ------
         WorkspaceError
-            If another process holds it.
+            If another process holds it, or nothing can be written there.
         """
-        with open(self.root / ".lock", "w", encoding="utf-8") as handle:
+        try:
+            handle = open(self.root / ".lock", "w", encoding="utf-8")  # noqa: SIM115
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.root}: nothing can be written there ({error.strerror}); check the permissions, or "
+                "work on a copy of the folder"
+            ) from error
+        with handle:
             try:
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
+            except BlockingIOError as error:
                 raise WorkspaceError(
                     f"{self.root}: another corrsfm works in this workspace; wait for it or choose another "
                     "folder"
                 ) from error
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise WorkspaceError(f"{self.root}: cannot be locked ({error.strerror})") from error
+                logger.warning(
+                    "%s: this file system has no locks (%s); do not let a second corrsfm work there now",
+                    self.root,
+                    error.strerror,
+                )
             self._values = self._load()
             yield
 
@@ -218,16 +264,35 @@ class Workspace:
         """
         record = self.record_of(stage)
         if record is None:
-            raise WorkspaceError(f"{self.root}: no {stage} yet; run: {self._command(stage)}")
+            raise WorkspaceError(f"{self.root}: no {stage} yet; run: {self.command_for(stage)}")
         for name, fingerprint in record.inputs.items():
             if self.require(name).fingerprint != fingerprint:
                 raise WorkspaceError(
-                    f"{self.root}: {stage} are older than {name}; run: {self._command(stage)}"
+                    f"{self.root}: {stage} are older than {name}; run: {self.command_for(stage)}"
                 )
         return record
 
-    def _command(self, stage: str) -> str:
-        return f"corrsfm {STAGE_COMMANDS[stage].format(workspace=self.root)}"
+    def current_record_of(self, stage: str) -> StageRecord | None:
+        """What is recorded of a stage if its inputs have not changed since; else None."""
+        try:
+            return self.require(stage)
+        except WorkspaceError:
+            return None
+
+    def command_for(self, stage: str) -> str:
+        """The command that makes a stage, with the options that it was made with, quoted for a shell.
+
+        The seed is not recorded with a stage and so not repeated.
+        """
+        command = STAGE_COMMANDS[stage]
+        words = ["corrsfm", command]
+        if command == "extract":
+            words.append(self._values["images_dir"] or "IMAGES")
+        words.append(str(self.root))
+        for name, options in _OPTIONS_OF_COMMAND[command].items():
+            if record := self.record_of(name):
+                words += _flags(options, record.config)
+        return shlex.join(words)
 
     def finish(self, stage: str, record: StageRecord) -> None:
         """Record a stage as finished now."""
@@ -239,3 +304,45 @@ class Workspace:
         """Drop the record of a stage, so that it is not taken for finished."""
         if self._values["stages"].pop(stage, None) is not None:
             atomic_write_json(self.manifest, self._values)
+
+    def put_models_aside(self) -> None:
+        """Move the models, and the reports about them, to ``sparse.old``, so that nobody takes them for new.
+
+        What was put aside before is replaced.
+        """
+        self.forget("models")
+        if not self.sparse.is_dir():
+            self.run_json.unlink(missing_ok=True)
+            return
+        for path in (self.run_json, self.report_json, self.report_html):
+            if path.exists():
+                os.replace(path, self.sparse / path.name)
+        aside = self.sparse.with_name("sparse.old")
+        if aside.exists():
+            shutil.rmtree(aside)
+        os.replace(self.sparse, aside)
+        logger.warning("the models of the earlier matches were put aside: %s", aside)
+
+
+def _check_manifest(values: dict[str, Any]) -> None:
+    """Raise now what a damaged manifest would raise later."""
+    if not isinstance(values["images_dir"], str | None):
+        raise TypeError("images_dir is no text")
+    for record in values["stages"].values():
+        StageRecord(**record)
+
+
+def _flags(options: type, values: dict[str, Any]) -> list[str]:
+    """The flags that give a config its recorded values, where they differ from the defaults."""
+    words: list[str] = []
+    for name, default in cfg.to_dict(options()).items():
+        value = values.get(name, default)
+        if value == default or value is None:
+            continue
+        flag = "--" + name.replace("_", "-")
+        if isinstance(value, bool):
+            words.append(flag if value else f"--no-{flag[2:]}")
+        else:
+            for item in value if isinstance(value, list) else [value]:
+                words += [flag, str(item)]
+    return words
