@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,19 +20,24 @@ if TYPE_CHECKING:
 
 __all__ = ["report"]
 
+logger = logging.getLogger("corrsfm")
+
 
 def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     """Gather the statistics of a workspace; write `report.json` and, if asked for, `report.html`.
 
-    Works without models too and then tells why there are none.
+    Works without models too and then tells why there are none. Models of earlier matches are left out.
     """
     from corrsfm.colmap import read_models, summarise_model
     from corrsfm.report import make_report
     from corrsfm.report.page import write_html
 
     workspace.require("verified matches")
-    models = read_models(workspace.sparse) if workspace.record_of("models") else []
     records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}
+    if "models" in records and not workspace.current_record_of("models"):
+        del records["models"]
+        logger.warning("models are older than the matches; run: %s", workspace.command_for("models"))
+    models = read_models(workspace.sparse) if "models" in records else []
     summary = make_report(
         scene=workspace.root.resolve().name,
         image_names=read_index(workspace).names,

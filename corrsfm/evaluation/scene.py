@@ -13,6 +13,7 @@ import numpy as np
 
 from corrsfm.errors import InputError
 from corrsfm.evaluation.metrics import Pose, pose_auc, position_errors, relative_pose_errors
+from corrsfm.workspace import Workspace
 
 __all__ = ["SCENE_THRESHOLDS_DEG", "SceneScore", "evaluate_scene", "find_model", "read_poses", "score_poses"]
 
@@ -72,7 +73,11 @@ def find_model(folder: Path) -> Path:
     ------
     InputError
         If there is none.
+    WorkspaceError
+        If the models of a workspace are older than what it now holds.
     """
+    if (folder / "workspace.json").exists() and not _is_model(folder):
+        Workspace(folder).require("models")
     for candidate in (folder, folder / "sparse" / "0", folder / "0"):
         if _is_model(candidate):
             return candidate
