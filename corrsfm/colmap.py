@@ -25,6 +25,7 @@ __all__ = [
     "database_errors",
     "is_sqlite",
     "observation_errors",
+    "pycolmap_version",
     "read_models",
     "summarise_model",
 ]
@@ -36,6 +37,11 @@ with contextlib.suppress(ValueError):
 
 _SILENT = 3
 _SMALLEST_DISK_BYTES = 1 << 20
+
+
+def pycolmap_version() -> str:
+    """Major and minor version, between which results may differ; for fingerprints."""
+    return ".".join(pycolmap.__version__.split(".")[:2])
 
 
 @contextlib.contextmanager

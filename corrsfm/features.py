@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap import pycolmap_version
 from corrsfm.config import Extractor, FeaturesConfig
 from corrsfm.types import Features
 
-__all__ = ["create_extractor", "extract_features", "quantise_descriptors", "scaled_size"]
+__all__ = ["algorithm_of", "create_extractor", "extract_features", "quantise_descriptors", "scaled_size"]
 
 # OpenCV divides its threshold by the three layers of an octave. The value is far below its default of 0.04
 # so that photos of low texture reach `max_features` too; keeping the strongest does the selection.
@@ -34,6 +35,13 @@ OPENCV_CONTRAST_THRESHOLD = 0.005
 PYCOLMAP_PEAK_THRESHOLD = 0.02 / 3
 DESCRIPTOR_SIZE = 128
 FINEST_OCTAVE = 255  # OpenCV keeps the octave in the low byte; -1 is the doubled photo
+
+
+def algorithm_of(extractor: Extractor) -> str:
+    """Version of the steps here and of the libraries they use, between which features may differ."""
+    library = "" if extractor == Extractor.OPENCV else f" pycolmap {pycolmap_version()}"
+    # OpenCV also reads and scales the photos that pycolmap sees.
+    return f"features-1 cv2 {'.'.join(cv2.__version__.split('.')[:2])}{library}"
 
 
 def create_extractor(

@@ -18,11 +18,18 @@ from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
-from corrsfm.errors import ImageError, InputError, WorkspaceError
+from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
 from corrsfm.files import sha256_of
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
-from corrsfm.resume import StageOutcome, complete, explain, explain_photos, finish
+from corrsfm.resume import (
+    StageOutcome,
+    complete,
+    explain,
+    explain_photos,
+    finish,
+    refuse_vanished_photos,
+)
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
 from corrsfm.summary import report
 from corrsfm.types import Correspondences, Features, ImageRecord, Matches, Pair, PairList
@@ -43,23 +50,33 @@ __all__ = [
 logger = logging.getLogger("corrsfm")
 
 CACHED_IMAGES = 512
-# LO-RANSAC runs a batch of pairs on native threads; a killed run loses at most one batch, a few seconds.
+# A killed run loses at most the pairs that are pruned together, which take a few seconds: a GPU and the
+# estimators on native threads want many, a network on a CPU takes up to a second for one.
 PAIRS_PRUNED_TOGETHER = 128
+PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD = 2
 
 
 def index_photos(
-    workspace: Workspace, images_dir: Path, config: cfg.ImagesConfig, run: cfg.RunConfig
+    workspace: Workspace,
+    images_dir: Path,
+    config: cfg.ImagesConfig,
+    run: cfg.RunConfig,
+    *,
+    overwrite: bool = False,
 ) -> StageOutcome:
     """List the photos, read their cameras and write the index.
 
     Raises
     ------
     InputError
-        If there are fewer than two photos, or the folder, list, masks or camera options cannot be used.
+        If there are fewer than two photos, or the folder, list, masks or camera options cannot be used, or,
+        without ``overwrite``, if most of the photos that the workspace knows are not in the folder.
     """
     from corrsfm.images import duplicate_images, index_images, name_remarks
 
     started = time.monotonic()
+    if images_dir.is_dir() and not overwrite:
+        refuse_vanished_photos(workspace, images_dir)
     cache = PhotoCache(workspace.photo_cache)
     records, cameras = index_images(
         images_dir, config, threads=count_threads(run.threads), hash_of=cache.hash_of, info_of=cache.info_of
@@ -93,15 +110,19 @@ def extract_features(
         Naming every photo that cannot be read; the features of the others are kept.
     """
     from corrsfm.colmap import colmap_log
-    from corrsfm.features import create_extractor
+    from corrsfm.features import algorithm_of, create_extractor
     from corrsfm.images import read_image, read_mask
 
     index = read_index(workspace)
     images = workspace.require("images")
+    algorithm = algorithm_of(config.extractor)
     wanted = {
-        record.name: config_hash("features", record.sha256, record.mask_sha256 or "", config)
+        record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
         for record in index.records
     }
+    # Of their own, so that these photos are tried again when there is another chance.
+    of_left_out = {name: config_hash("left out", fingerprint) for name, fingerprint in wanted.items()}
+    store = ItemStore(workspace.features, FEATURES)
     records = {record.name: record for record in index.records}
     extract = create_extractor(config)
     mask_dir = images.config.get("mask_dir")
@@ -122,6 +143,7 @@ def extract_features(
                 yield name, result
             elif images.config.get("skip_unreadable"):
                 logger.warning("left out: %s", result)
+                wanted[name] = of_left_out[name]
                 yield name, _no_features(index, records[name])
             else:
                 unreadable.append(str(result))
@@ -133,10 +155,15 @@ def extract_features(
             )
 
     with colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext():
+        if images.config.get("skip_unreadable"):
+            for name in sorted(store.finished(of_left_out)):
+                if isinstance(result := work(name), ImageError):
+                    logger.warning("left out: %s", result)
+                    wanted[name] = of_left_out[name]
         return complete(
             workspace,
             "features",
-            ItemStore(workspace.features, FEATURES),
+            store,
             wanted,
             produce,
             config,
@@ -224,34 +251,33 @@ def prune_matches(
     matches = workspace.require("matches")
     putative = ItemStore(workspace.matches, MATCHES)
     match_fingerprints = _wanted_matches(workspace)
-    if len(putative.finished(match_fingerprints)) < len(match_fingerprints):
-        raise WorkspaceError(
-            f"{workspace.matches}: older than the features; run: corrsfm match {workspace.root}"
-        )
-    pruner = build_pruner(
-        config, device=find_device(run.device), seed=run.seed, threads=count_threads(run.threads)
-    )
+    device, threads = find_device(run.device), count_threads(run.threads)
+    pruner = build_pruner(config, device=device, seed=run.seed, threads=threads)
+    group_size = _num_pruned_together(config.method, device, threads)
     wanted = {
         pair: config_hash("prune", fingerprint, pruner.fingerprint, cameras[pair[0]], cameras[pair[1]])
         for pair, fingerprint in match_fingerprints.items()
     }
-    use_threads(count_threads(run.threads))
+    use_threads(threads)
     with ItemStore(workspace.features, FEATURES).reader() as load, putative.reader() as read_matches:
         read_features = functools.lru_cache(maxsize=CACHED_IMAGES)(load)
 
-        def gather(pair: Pair, found: Matches) -> Correspondences:
+        def gather(pair: Pair, matched: Matches) -> Correspondences:
             features0, features1 = (read_features(name) for name in pair)
             camera0, camera1 = (cameras[name] for name in pair)
-            return make_correspondences(features0, features1, found, camera0, camera1, " – ".join(pair))
+            return make_correspondences(features0, features1, matched, camera0, camera1, " – ".join(pair))
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, PrunedMatches]]:
-            for start in range(0, len(missing), PAIRS_PRUNED_TOGETHER):
-                batch = [
-                    (pair, read_matches(pair)) for pair in missing[start : start + PAIRS_PRUNED_TOGETHER]
-                ]
-                results = pruner([gather(pair, found) for pair, found in batch])
-                for (pair, found), result in zip(batch, results, strict=True):
-                    yield pair, PrunedMatches.from_result(found, result)
+            found = putative.fingerprints(missing)
+            if any(found[pair] != match_fingerprints[pair] for pair in missing):
+                raise WorkspaceError(
+                    f"{workspace.matches}: older than the features; run: {workspace.command_for('matches')}"
+                )
+            for start in range(0, len(missing), group_size):
+                batch = [(pair, read_matches(pair)) for pair in missing[start : start + group_size]]
+                results = pruner([gather(pair, matched) for pair, matched in batch])
+                for (pair, matched), result in zip(batch, results, strict=True):
+                    yield pair, PrunedMatches.from_result(matched, result)
 
         return complete(
             workspace,
@@ -270,12 +296,15 @@ def verify_matches(
     workspace: Workspace, config: cfg.DatabaseConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
     """Write the COLMAP database and verify the pruned matches geometrically."""
+    from corrsfm.colmap import pycolmap_version
     from corrsfm.database import write_database
 
     started = time.monotonic()
     index = read_index(workspace)
     pruned = workspace.require("pruned matches")
-    fingerprint = config_hash("verified matches", pruned.fingerprint, index.cameras, config, run.seed)
+    fingerprint = config_hash(
+        "verified matches", pycolmap_version(), pruned.fingerprint, index.cameras, config, run.seed
+    )
     pair_list = read_pairs(workspace)
     if not overwrite and workspace.is_current("verified matches", fingerprint, workspace.database):
         return StageOutcome(
@@ -313,13 +342,14 @@ def reconstruct(
     Raises
     ------
     ReconstructionError
-        If no model came out, with the reason.
+        If no model came out, with the reason; models of earlier matches are then in ``sparse.old``.
     """
+    from corrsfm.colmap import pycolmap_version
     from corrsfm.reconstruction import reconstruct as map_database
 
     started = time.monotonic()
     verified = workspace.require("verified matches")
-    fingerprint = config_hash("models", verified.fingerprint, config, run.seed)
+    fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
     if not overwrite and workspace.is_current("models", fingerprint, workspace.sparse / "0"):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
@@ -332,16 +362,20 @@ def reconstruct(
             bar.n = num_registered
             bar.refresh()
 
-        models = map_database(
-            workspace.database,
-            workspace.images_dir,
-            workspace.sparse,
-            config=config,
-            seed=run.seed,
-            num_threads=count_threads(run.threads),
-            log_file=workspace.log,
-            on_progress=on_progress,
-        )
+        try:
+            models = map_database(
+                workspace.database,
+                workspace.images_dir,
+                workspace.sparse,
+                config=config,
+                seed=run.seed,
+                num_threads=count_threads(run.threads),
+                log_file=workspace.log,
+                on_progress=on_progress,
+            )
+        except ReconstructionError:
+            workspace.put_models_aside()
+            raise
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
@@ -365,9 +399,17 @@ def _wanted_matches(workspace: Workspace) -> dict[Pair, str]:
     """Fingerprint that the putative matches of each pair must carry."""
     fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(read_index(workspace).names)
     return {
-        pair: config_hash("matches", fingerprints[pair[0]], fingerprints[pair[1]])
+        pair: config_hash("matches-1", fingerprints[pair[0]], fingerprints[pair[1]])
         for pair in read_pairs(workspace).pairs
     }
+
+
+def _num_pruned_together(method: cfg.PruneMethod, device: str, threads: int) -> int:
+    with_network = method in (cfg.PruneMethod.CORRADAPTOR, cfg.PruneMethod.CASCADE)
+    on_cpu = device == "cpu"
+    return (
+        PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD * threads if with_network and on_cpu else PAIRS_PRUNED_TOGETHER
+    )
 
 
 def _no_features(index: Index, record: ImageRecord) -> Features:

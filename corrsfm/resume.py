@@ -7,20 +7,22 @@ is the set of its items; it is current when every item is there with the fingerp
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from corrsfm import config as cfg
-from corrsfm.errors import WorkspaceError, first_few
+from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.index import Index, read_index
 from corrsfm.store import ItemStore
 from corrsfm.workspace import StageRecord, Workspace
 
-__all__ = ["StageOutcome", "complete", "explain", "explain_photos", "finish"]
+__all__ = ["StageOutcome", "complete", "explain", "explain_photos", "finish", "refuse_vanished_photos"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -72,7 +74,8 @@ def complete(
     wanted : mapping
         Key → fingerprint of every item the stage consists of.
     produce : callable
-        Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for.
+        Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for. It
+        may first change what is ``wanted`` of the key, if it cannot make that.
     config : dataclass
         The stage's options, for the record.
     inputs : dict
@@ -103,6 +106,7 @@ def complete(
         )
     finally:
         store.close()
+    fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
     outcome = StageOutcome(
         stage=stage, num_items=len(wanted), num_reused=len(finished), seconds=time.monotonic() - started
     )
@@ -166,3 +170,24 @@ def explain_photos(workspace: Workspace, index: Index) -> None:
         if names:
             shown = first_few(sorted(names))
             logger.info("photos %s since the last run: %d (%s)", text, len(names), shown)
+
+
+def refuse_vanished_photos(workspace: Workspace, images_dir: Path) -> None:
+    """Stop before a folder that is wrong or not mounted costs the work on the photos that it should hold.
+
+    Raises
+    ------
+    InputError
+        If more than half of the photos that the workspace knows are not in the folder.
+    """
+    try:
+        known = read_index(workspace).names
+    except WorkspaceError:
+        return
+    gone = [name for name in known if not os.path.exists(images_dir / name)]
+    if 2 * len(gone) > len(known):
+        raise InputError(
+            f"{images_dir}: {len(gone)} of the {len(known)} photos of {workspace.root} are not there "
+            f"({first_few(gone)}); mount or correct the folder; if they are really gone, add --overwrite "
+            "to do everything again without them"
+        )

@@ -45,7 +45,7 @@ def run_scene(
     workspace = Workspace(workspace_dir, create=True)
     run = config.run
     with workspace.lock():
-        pipeline.index_photos(workspace, images_dir, config.images, run)
+        pipeline.index_photos(workspace, images_dir, config.images, run, overwrite=overwrite)
         pipeline.extract_features(workspace, config.features, run, overwrite=overwrite)
         pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite)
         pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite)

@@ -18,12 +18,14 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from photos import write_photo, write_photos
 
+from corrsfm import colmap, features, files, images, index, pipeline
 from corrsfm import config as cfg
-from corrsfm import files, images, index, pipeline
-from corrsfm.errors import ImageError, WorkspaceError
+from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
 from corrsfm.index import read_index, read_pairs
+from corrsfm.run import run_scene
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
-from corrsfm.workspace import Workspace
+from corrsfm.types import Correspondences, PruneResult
+from corrsfm.workspace import StageRecord, Workspace
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 SMALL = cfg.FeaturesConfig(max_features=60)
@@ -330,3 +332,144 @@ def test_a_truncated_photo_is_left_out_on_request(workspace: Workspace, photos: 
     (photos / "2.png").write_bytes(whole[: len(whole) // 2])
     pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
     assert pipeline.extract_features(workspace, SMALL, RUN).num_items == len(read_index(workspace).names)
+
+
+def test_a_left_out_photo_is_tried_again(
+    workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    skipping, strict = cfg.ImagesConfig(skip_unreadable=True), cfg.ImagesConfig()
+    pipeline.index_photos(workspace, photos, skipping, RUN)
+
+    def fail_once(path: Path) -> object:
+        if path.name == "2.png":
+            raise ImageError("2.png: Input/output error")
+        return read_image(path)
+
+    read_image = images.read_image
+    with monkeypatch.context() as patch:
+        patch.setattr(images, "read_image", fail_once)
+        assert pipeline.extract_features(workspace, SMALL, RUN).num_reused == 0
+        written = workspace.features.stat().st_mtime_ns
+        caplog.clear()
+        # Still unreadable: said again, but nothing is written again.
+        assert pipeline.extract_features(workspace, SMALL, RUN).skipped
+        assert "left out: 2.png: Input/output error" in caplog.text
+        assert workspace.features.stat().st_mtime_ns == written
+        pipeline.index_photos(workspace, photos, strict, RUN)
+        with pytest.raises(ImageError, match=r"2\.png: Input/output error"):
+            pipeline.extract_features(workspace, SMALL, RUN)
+    assert len(ItemStore(workspace.features, FEATURES).read("2.png")) == 0
+    outcome = pipeline.extract_features(workspace, SMALL, RUN)
+    assert (outcome.num_items, outcome.num_reused) == (4, 3)
+    assert len(ItemStore(workspace.features, FEATURES).read("2.png")) > 10
+
+
+def test_a_folder_without_most_photos_costs_no_finished_work(
+    workspace: Workspace, photos: Path, tmp_path: Path
+) -> None:
+    run_front(workspace, photos)
+    before = contents(workspace)
+    other = tmp_path / "other"
+    write_photos(other, 2)
+    (other / "1.png").rename(other / "new.png")
+    with pytest.raises(
+        InputError, match=rf"{other}: 3 of the 4 photos of .* are not there \(1.png, 2.png, 3.png\); mount"
+    ):
+        run_front(workspace, other)
+    assert contents(workspace) == before
+    assert run_front(workspace, photos)["pruned matches"] == (6, 6)
+    pipeline.index_photos(workspace, other, cfg.ImagesConfig(), RUN, overwrite=True)
+    assert read_index(workspace).names == ["0.png", "new.png"]
+
+
+def test_photos_that_a_list_leaves_out_have_not_vanished(
+    workspace: Workspace, photos: Path, tmp_path: Path
+) -> None:
+    write_photo(photos / "4.png", 160)
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    (tmp_path / "list.txt").write_text("0.png\n1.png\n")
+    config = cfg.ImagesConfig(image_list=tmp_path / "list.txt")
+    assert pipeline.index_photos(workspace, photos, config, RUN).num_items == 2
+
+
+def test_another_version_of_a_library_does_not_mix_with_what_the_old_one_made(
+    workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def finish() -> list[bool]:
+        return [
+            pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped,
+            pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN).skipped,
+        ]
+
+    run_front(workspace, photos)
+    finish()
+    assert finish() == [True, True]
+    monkeypatch.setattr(colmap.pycolmap, "__version__", "99.1.0")
+    assert run_front(workspace, photos)["features"] == (4, 4)
+    assert finish() == [False, False]
+    monkeypatch.setattr(features.cv2, "__version__", "99.1.0")
+    assert run_front(workspace, photos)["features"] == (4, 0)
+
+
+@pytest.mark.parametrize(
+    ("method", "sizes"), [(cfg.PruneMethod.CORRADAPTOR, [4, 2]), (cfg.PruneMethod.LORANSAC, [6])]
+)
+def test_a_killed_run_loses_few_pairs_of_a_slow_network(
+    workspace: Workspace,
+    photos: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    method: cfg.PruneMethod,
+    sizes: list[int],
+) -> None:
+    seen = []
+
+    class Keep:
+        name = fingerprint = "keep"
+
+        def __call__(self, pairs: list[Correspondences]) -> list[PruneResult]:
+            seen.append(len(pairs))
+            return [
+                PruneResult(scores=np.ones(len(pair), np.float32), inlier_mask=np.ones(len(pair), bool))
+                for pair in pairs
+            ]
+
+    run_front(workspace, photos)
+    monkeypatch.setattr("corrsfm.prune.build_pruner", lambda config, **options: Keep())
+    run = cfg.RunConfig(threads=2, device="cpu")
+    pipeline.prune_matches(workspace, cfg.PruneConfig(method=method), run)
+    assert seen == sizes
+
+
+def test_matches_that_do_not_belong_to_the_features_are_not_pruned(
+    workspace: Workspace, photos: Path
+) -> None:
+    run_front(workspace, photos)
+    matches, record = workspace.matches.read_bytes(), workspace.require("matches")
+    run_front(workspace, photos, features=cfg.FeaturesConfig(max_features=40))
+    now = workspace.require("matches")
+    workspace.matches.write_bytes(matches)
+    assert record.fingerprint != now.fingerprint
+    config = cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=0.3)
+    with pytest.raises(WorkspaceError, match=r"matches\.h5: older than the features; run: corrsfm match"):
+        pipeline.prune_matches(workspace, config, RUN)
+
+
+def test_a_failed_mapping_leaves_no_stale_model_to_take_for_new(tmp_path: Path, photos: Path) -> None:
+    workspace = Workspace(tmp_path / "scene", create=True)
+    run_front(workspace, photos)
+    workspace.finish("models", StageRecord(fingerprint="of earlier matches"))
+    (workspace.sparse / "0").mkdir(parents=True)
+    workspace.run_json.write_text("of earlier matches")
+    # No pair has as many inliers.
+    config = cfg.PipelineConfig(
+        features=SMALL,
+        prune=cfg.PruneConfig(method=cfg.PruneMethod.RATIO),
+        database=cfg.DatabaseConfig(min_num_inliers=1000),
+        run=RUN,
+    )
+    with pytest.raises(ReconstructionError):
+        run_scene(photos, workspace.root, config)
+    assert not workspace.sparse.exists() and not workspace.run_json.exists()
+    assert (workspace.root / "sparse.old" / "run.json").read_text() == "of earlier matches"
+    assert '"models": []' in workspace.report_json.read_text()
+    assert Workspace(workspace.root).record_of("models") is None

@@ -79,7 +79,7 @@ def extract(
     workspace = Workspace(workspace_dir, create=True)
     with workspace.lock():
         outcomes = [
-            pipeline.index_photos(workspace, images_dir, images, run),
+            pipeline.index_photos(workspace, images_dir, images, run, overwrite=overwrite),
             pipeline.extract_features(workspace, features, run, overwrite=overwrite),
             pipeline.make_pairs(workspace, pairs, run, overwrite=overwrite),
             pipeline.match_pairs(workspace, matches, run, overwrite=overwrite),

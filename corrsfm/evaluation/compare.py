@@ -160,7 +160,7 @@ def _scene_name(images_dir: Path) -> str:
 def _prepare(base: Workspace, images_dir: Path, config: PipelineConfig, overwrite: bool) -> None:
     run = config.run
     with base.lock():
-        pipeline.index_photos(base, images_dir, config.images, run)
+        pipeline.index_photos(base, images_dir, config.images, run, overwrite=overwrite)
         pipeline.extract_features(base, config.features, run, overwrite=overwrite)
         pipeline.make_pairs(base, config.pairs, run, overwrite=overwrite)
         pipeline.match_pairs(base, config.matches, run, overwrite=overwrite)
