@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import logging
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.config import CameraMode
-from corrsfm.errors import ConfigError, InputError
+from corrsfm.errors import ConfigError, InputError, first_few
 from corrsfm.types import Camera
 
 if TYPE_CHECKING:
@@ -22,6 +23,10 @@ __all__ = ["PhotoInfo", "assign_cameras", "camera_from_pycolmap", "normalise_poi
 
 # COLMAP's guess where nothing is known: a field of view of about 45° along the longest side.
 DEFAULT_FOCAL_FACTOR = 1.2
+# EXIF rounds focal lengths by a few per cent; photos of one camera that differ by more were zoomed.
+SAME_FOCAL_RATIO = 1.05
+
+logger = logging.getLogger("corrsfm")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +65,8 @@ def assign_cameras(
     mode : CameraMode
         ``auto`` shares a camera among photos of equal size, EXIF camera and focal length. Photos without EXIF
         get one each, as in COLMAP: equal size is no proof, and a wrongly shared camera ruins a model.
+        A camera that photos share by any other mode starts from the median of their known focal lengths; a
+        warning names its photos if these differ by more than a few per cent.
     model : str
         COLMAP camera model.
     params : str
@@ -82,19 +89,23 @@ def assign_cameras(
     """
     values = _parse_params(model, params)
     keys = [_camera_key(name, info, mode) for name, info in zip(names, infos, strict=True)]
-    first = {key: index for index, key in reversed(list(enumerate(keys)))}
-    for name, info, key in zip(names, infos, keys, strict=True):
-        reference = infos[first[key]]
+    groups: dict[tuple, list[int]] = defaultdict(list)
+    for index, key in enumerate(keys):
+        groups[key].append(index)
+        info, reference = infos[index], infos[groups[key][0]]
         if (info.width, info.height) != (reference.width, reference.height):
             raise InputError(
-                f"{name}: has {info.width}×{info.height} pixels, but '{names[first[key]]}', which is to share"
-                f" its camera, has {reference.width}×{reference.height}; try --camera-mode auto or remove one"
+                f"{names[index]}: has {info.width}×{info.height} pixels, but '{names[groups[key][0]]}', which"
+                f" is to share its camera, has {reference.width}×{reference.height}; try --camera-mode auto"
+                " or remove one"
             )
     if values:
         _check_one_size(names, infos)
-    order = sorted(first, key=lambda key: first[key])
-    cameras = [_make_camera(infos[first[key]], model, values) for key in order]
-    position = {key: index for index, key in enumerate(order)}
+    else:
+        for group in groups.values():
+            _warn_of_zoom([(names[index], infos[index].focal_px) for index in group])
+    cameras = [_make_camera([infos[index] for index in group], model, values) for group in groups.values()]
+    position = {key: index for index, key in enumerate(groups)}
     return cameras, [position[key] for key in keys]
 
 
@@ -111,14 +122,31 @@ def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
     return (name,)
 
 
-def _make_camera(info: PhotoInfo, model: str, values: list[float]) -> Camera:
+def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:
+    """Say so if photos that share a camera, given as names and focal lengths, were taken at several."""
+    known = sorted((focal, name) for name, focal in focals if focal is not None)
+    if known and known[-1][0] > SAME_FOCAL_RATIO * known[0][0]:
+        logger.warning(
+            "%d photos share a camera (%s), but their focal lengths in EXIF run from %.0f px ('%s') to"
+            " %.0f px ('%s'), as if zoomed; --camera-mode auto gives each focal length a camera",
+            len(focals),
+            first_few(name for name, _ in focals),
+            *known[0],
+            *known[-1],
+        )
+
+
+def _make_camera(infos: Sequence[PhotoInfo], model: str, values: list[float]) -> Camera:
+    """The camera of some photos of one size."""
     import pycolmap
 
-    focal = info.focal_px or DEFAULT_FOCAL_FACTOR * max(info.width, info.height)
-    camera = pycolmap.Camera.create_from_model_name(1, model, focal, info.width, info.height)
+    width, height = infos[0].width, infos[0].height
+    known = [info.focal_px for info in infos if info.focal_px is not None]
+    focal = float(np.median(known)) if known else DEFAULT_FOCAL_FACTOR * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
     if values:
         camera.params = values
-    camera.has_prior_focal_length = bool(values) or info.focal_px is not None
+    camera.has_prior_focal_length = bool(values) or bool(known)
     return camera_from_pycolmap(camera)
 
 

@@ -1,5 +1,7 @@
 """Which photos share a camera, and points normalised by it."""
 
+import dataclasses
+
 import numpy as np
 import pycolmap
 import pytest
@@ -50,6 +52,24 @@ def test_the_focal_length_comes_from_exif_or_is_guessed() -> None:
     assert cameras[0].has_prior_focal_length
     assert cameras[1].params == (1.2 * 640, 320.0, 240.0, 0.0)
     assert not cameras[1].has_prior_focal_length
+
+
+@pytest.mark.parametrize("mode", [CameraMode.SINGLE, CameraMode.PER_FOLDER])
+def test_a_shared_camera_has_the_median_of_the_known_focal_lengths(mode: CameraMode) -> None:
+    infos = [PLAIN, PHONE, dataclasses.replace(PHONE, focal_px=510.0), PLAIN, PHONE]
+    cameras, ids = assign_cameras([*"abcde"], infos, mode=mode, model="SIMPLE_RADIAL")
+    assert ids == [0] * 5
+    assert cameras[0].params == (500.0, 320.0, 240.0, 0.0)
+    assert cameras[0].has_prior_focal_length
+
+
+def test_zoomed_photos_that_share_a_camera_are_named(caplog: pytest.LogCaptureFixture) -> None:
+    names = ["a/1", "a/2", "b/1", "b/2"]
+    nearly = dataclasses.replace(PHONE, focal_px=510.0)
+    ids_of([PHONE, ZOOMED, PHONE, nearly], CameraMode.PER_FOLDER, names)
+    (text,) = caplog.messages
+    assert text.startswith("2 photos share a camera (a/1, a/2), but")
+    assert "500 px ('a/1') to 900 px ('a/2')" in text
 
 
 def test_known_parameters_are_taken_as_they_are() -> None:
