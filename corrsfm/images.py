@@ -7,6 +7,7 @@ mask and keypoints must speak of the same frame.
 from __future__ import annotations
 
 import logging
+import math
 import os
 import unicodedata
 from collections import Counter, defaultdict
@@ -76,7 +77,7 @@ def index_images(
     """
     hash_of = hash_of or sha256_of
     info_of = info_of or read_photo_info
-    names = list_images(folder, image_list=config.image_list)
+    names = list_images(folder, image_list=config.image_list, mask_dir=config.mask_dir)
 
     def read(name: str) -> tuple[str, PhotoInfo] | ImageError:
         try:
@@ -118,7 +119,7 @@ def index_images(
     return records, cameras
 
 
-def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
+def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path | None = None) -> list[str]:
     """Names of the photos in a folder and its sub-folders, sorted.
 
     Parameters
@@ -128,6 +129,9 @@ def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
     image_list : Path, optional
         Text file with one name per line, relative to the folder; ``#`` starts a comment line. Only these
         photos are used, whatever their suffix.
+    mask_dir : Path, optional
+        Folder of masks. If it lies inside the folder, what it holds is no photo; if it is the folder itself,
+        ``NAME.png`` beside a photo ``NAME`` is none. A list overrules this.
 
     Returns
     -------
@@ -145,6 +149,8 @@ def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
     files = _visible_files(folder)
     if image_list is None:
         names = [name for name in files if name.lower().endswith(IMAGE_SUFFIXES)]
+        if mask_dir is not None:
+            names = _without_masks(names, folder, mask_dir)
         where = str(folder)
     else:
         names = _read_image_list(image_list, folder)
@@ -153,6 +159,12 @@ def list_images(folder: Path, *, image_list: Path | None = None) -> list[str]:
     if unprintable:
         raise InputError(
             f"{folder}: names are not valid UTF-8: {first_few(map(repr, unprintable))}; rename them"
+        )
+    separating = [name for name in names if "\t" in name or name.splitlines() != [name]]
+    if separating:
+        raise InputError(
+            f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot:"
+            f" {first_few(map(ascii, separating))}; rename them"
         )
     if len(names) < 2:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
@@ -176,6 +188,22 @@ def _visible_files(folder: Path) -> list[str]:
         relative = Path(root).relative_to(folder)
         names.extend((relative / name).as_posix() for name in files if not name.startswith("."))
     return sorted(names)
+
+
+def _without_masks(names: Sequence[str], folder: Path, mask_dir: Path) -> list[str]:
+    """The names that are no masks."""
+    masks, photos = mask_dir.resolve(), folder.resolve()
+    if masks == photos:
+        listed = set(names)
+        return [name for name in names if not (name.endswith(".png") and name[:-4] in listed)]
+    if not masks.is_relative_to(photos):
+        return list(names)
+    # Folders, since a mask may itself be a link to elsewhere.
+    inside = {
+        parent: (folder / parent).resolve().is_relative_to(masks)
+        for parent in {PurePosixPath(name).parent for name in names}
+    }
+    return [name for name in names if not inside[PurePosixPath(name).parent]]
 
 
 def _read_image_list(image_list: Path, folder: Path) -> list[str]:
@@ -319,18 +347,27 @@ def read_photo_info(path: Path) -> PhotoInfo:
         # A format that pycolmap does not know (WebP) or a file that cannot be read at all.
         height, width = read_image(path).shape
         return PhotoInfo(width=width, height=height)
-    latitude, longitude = bitmap.exif_latitude(), bitmap.exif_longitude()
-    gps = None
-    # Receivers without a fix write zeros.
-    if latitude is not None and longitude is not None and (latitude, longitude) != (0.0, 0.0):
-        gps = (float(latitude), float(longitude), float(bitmap.exif_altitude() or 0.0))
     return PhotoInfo(
         width=int(bitmap.width),
         height=int(bitmap.height),
         camera_name=bitmap.exif_camera_model() or None,
         focal_px=bitmap.exif_focal_length() or None,
-        gps=gps,
+        gps=_position(bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()),
     )
+
+
+def _position(
+    latitude: float | None, longitude: float | None, altitude: float | None
+) -> tuple[float, float, float] | None:
+    """The position in EXIF if it is one on earth; an altitude that is none becomes 0."""
+    # Receivers without a fix write 0, or 0/0, which is read as NaN.
+    if latitude is None or longitude is None or (latitude, longitude) == (0.0, 0.0):
+        return None
+    # Comparisons with NaN are false.
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        return None
+    metres = float(altitude or 0.0)
+    return float(latitude), float(longitude), metres if math.isfinite(metres) else 0.0
 
 
 def _census(files: Sequence[str]) -> str:

@@ -42,6 +42,7 @@ def write_jpeg_with_exif(
     focal_35mm: int = 0,
     orientation: int = 1,
     gps: tuple[int, int, int] | None = None,
+    gps_denominators: tuple[int, int] = (1, 1),
 ) -> None:
     """Write a JPEG.
 
@@ -55,7 +56,9 @@ def write_jpeg_with_exif(
     orientation : int
         EXIF orientation; 6 means "turn clockwise to look at it".
     gps : tuple of int, optional
-        Whole degrees south and west, metres of altitude.
+        Degrees south and west, metres of altitude; numerators of the rationals that EXIF holds.
+    gps_denominators : tuple of int
+        Of the degrees and of the metres.
     """
     main: list[tuple[int, int, tuple[int, ...] | bytes]] = [(0x0112, SHORT, (orientation,))]
     if make:
@@ -72,13 +75,14 @@ def write_jpeg_with_exif(
     gps_directory = b""
     if gps:
         south, west, metres = gps
+        of_degrees, of_metres = gps_denominators
         gps_directory = _directory(
             [
                 (1, ASCII, b"S\0"),
-                (2, RATIONAL, (south, 1, 0, 1, 0, 1)),
+                (2, RATIONAL, (south, of_degrees, 0, 1, 0, 1)),
                 (3, ASCII, b"W\0"),
-                (4, RATIONAL, (west, 1, 0, 1, 0, 1)),
-                (6, RATIONAL, (metres, 1)),
+                (4, RATIONAL, (west, of_degrees, 0, 1, 0, 1)),
+                (6, RATIONAL, (metres, of_metres)),
             ],
             gps_offset,
         )

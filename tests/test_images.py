@@ -107,6 +107,32 @@ def test_names_that_are_not_utf8_are_refused(folder: Path) -> None:
         list_images(folder)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse some of these names themselves")
+@pytest.mark.parametrize("separator", ["\t", "\n", "\r", "\x0b", "\x85", "\u2028"], ids=ascii)
+def test_names_that_lists_cannot_hold_are_refused(folder: Path, separator: str) -> None:
+    write(folder / f"one{separator}two.png", picture())
+    with pytest.raises(InputError, match=r"a tab or a line break.*'one\\.+two\.png'; rename"):
+        list_images(folder)
+
+
+def test_masks_inside_the_folder_are_no_photos(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = list_images(folder)
+    for name in photos:
+        write(folder / "sub" / "masks" / f"{name}.png", np.zeros((48, 64), np.uint8))
+    assert len(list_images(folder)) == 2 * len(photos)
+    assert list_images(folder, mask_dir=folder / "sub" / "masks") == photos
+    monkeypatch.chdir(folder / "sub")
+    assert list_images(folder, mask_dir=Path("masks")) == photos
+    records, _ = index_images(folder, ImagesConfig(mask_dir=Path("masks")))
+    assert [(record.name, record.mask) for record in records] == [(name, f"{name}.png") for name in photos]
+
+
+def test_masks_beside_the_photos_are_no_photos(folder: Path) -> None:
+    photos = list_images(folder)
+    write(folder / "b.jpg.png", np.zeros((48, 64), np.uint8))
+    assert list_images(folder, mask_dir=folder) == photos
+
+
 def test_remarks_name_what_other_programs_stumble_over() -> None:
     assert name_remarks(["a.jpg", "b/c.jpg"]) == []
     remarks = name_remarks(["my photo.jpg", "a/b.jpg", "a-b.jpg", "A/B.jpg"])
@@ -186,6 +212,25 @@ def test_zero_coordinates_are_no_position(tmp_path: Path) -> None:
     path = tmp_path / "photo.jpg"
     write_jpeg_with_exif(path, picture(), gps=(0, 0, 0))
     assert read_photo_info(path).gps is None
+
+
+@pytest.mark.parametrize(
+    ("gps", "denominators"),
+    [((0, 0, 5), (0, 1)), ((7, 8, 5), (0, 1)), ((4000, 70, 5), (1, 1)), ((33, 181, 5), (1, 1))],
+)
+def test_coordinates_that_are_not_on_earth_are_no_position(
+    tmp_path: Path, gps: tuple[int, int, int], denominators: tuple[int, int]
+) -> None:
+    path = tmp_path / "photo.jpg"
+    write_jpeg_with_exif(path, picture(), gps=gps, gps_denominators=denominators)
+    assert read_photo_info(path).gps is None
+
+
+@pytest.mark.parametrize("metres", [0, 5])
+def test_an_altitude_that_is_no_number_is_zero(tmp_path: Path, metres: int) -> None:
+    path = tmp_path / "photo.jpg"
+    write_jpeg_with_exif(path, picture(), gps=(33, 70, metres), gps_denominators=(1, 0))
+    assert read_photo_info(path).gps == (-33.0, -70.0, 0.0)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
