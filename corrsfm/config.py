@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import tomllib
 import types
 import typing
@@ -43,6 +44,10 @@ __all__ = [
     "option",
     "to_dict",
 ]
+
+
+# What native code counts in.
+LARGEST_INT = 2**31 - 1
 
 
 class CameraMode(StrEnum):
@@ -108,7 +113,14 @@ class Mapper(StrEnum):
 
 
 def option(
-    default: Any, text: str, *, unit: str = "", minimum: float | None = None, affects_result: bool = True
+    default: Any,
+    text: str,
+    *,
+    unit: str = "",
+    minimum: float | None = None,
+    above: float | None = None,
+    maximum: float | None = None,
+    affects_result: bool = True,
 ) -> Any:
     """A dataclass field with what the command line and the resume logic need to know about it.
 
@@ -121,12 +133,23 @@ def option(
         Unit shown in the help.
     minimum : float, optional
         Smallest valid value.
+    above : float, optional
+        Valid values are larger than this.
+    maximum : float, optional
+        Largest valid value; for whole numbers `LARGEST_INT` if not given. Floats must be finite in any case.
     affects_result : bool
         False for options of speed and memory only: they do not make finished work stale.
     """
     return field(
         default=default,
-        metadata={"help": text, "unit": unit, "minimum": minimum, "affects_result": affects_result},
+        metadata={
+            "help": text,
+            "unit": unit,
+            "minimum": minimum,
+            "above": above,
+            "maximum": maximum,
+            "affects_result": affects_result,
+        },
     )
 
 
@@ -173,7 +196,7 @@ class PairsConfig:
     loop_closure: bool = option(False, "Add retrieval pairs to a sequence, to close loops")
     num_retrieved: int = option(30, "Most similar photos paired with each photo", minimum=1)
     num_spatial: int = option(30, "Nearest photos by GPS paired with each photo", minimum=1)
-    max_distance_m: float = option(150.0, "Farthest GPS neighbour", unit="m", minimum=0)
+    max_distance_m: float = option(150.0, "Farthest GPS neighbour", unit="m", above=0)
     pairs_file: Path | None = option(None, "Text file with 'name0 name1' per line, for the strategy file")
     covisible_model: Path | None = option(None, "COLMAP model folder, for the strategy covisibility")
     num_covisible: int = option(30, "Photos with most shared points paired with each photo", minimum=1)
@@ -201,8 +224,8 @@ class PruneConfig:
     operating_point: OperatingPoint = option(
         OperatingPoint.SFM, "sfm keeps what mapping can use; pose is strict, for two-view poses"
     )
-    max_ratio: float = option(0.8, "Largest descriptor distance ratio of the ratio test", minimum=0)
-    max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", minimum=0)
+    max_ratio: float = option(0.8, "Largest descriptor distance ratio of the ratio test", above=0)
+    max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", above=0)
     max_candidates: int = option(2000, "Matches per pair that the network sees, best ratio first", minimum=16)
     precision: Precision = option(
         Precision.AUTO, "Number format of the network; auto is bfloat16 where it is faster"
@@ -220,7 +243,7 @@ class DatabaseConfig:
     """Geometric verification inside the COLMAP database."""
 
     min_num_inliers: int = option(15, "Fewest verified matches of a pair that mapping may use", minimum=1)
-    verification_error_px: float = option(4.0, "Inlier threshold of the verification", unit="px", minimum=0)
+    verification_error_px: float = option(4.0, "Inlier threshold of the verification", unit="px", above=0)
     write_descriptors: bool = option(False, "Also write descriptors, for tools that need them")
 
 
@@ -236,7 +259,10 @@ class ReconstructionConfig:
         0, "Write a snapshot every so many registered photos; 0 for none", minimum=0, affects_result=False
     )
     max_runtime_minutes: float = option(
-        0.0, "Stop mapping after so long and keep what there is; 0 for no limit", minimum=0
+        0.0,
+        "Stop mapping after so long and keep what there is; 0 for no limit",
+        minimum=0,
+        maximum=LARGEST_INT // 60,
     )
 
 
@@ -246,7 +272,7 @@ class RunConfig:
 
     seed: int = option(0, "Seed of everything random", minimum=0)
     device: str = option("auto", "auto, cpu, cuda or cuda:N", affects_result=False)
-    threads: int = option(0, "Threads to use; 0 for all cores", minimum=0, affects_result=False)
+    threads: int = option(0, "Threads to use; 0 for all cores", minimum=0, maximum=1024, affects_result=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -346,10 +372,26 @@ def _build(cls: type[T], values: dict[str, Any], prefix: str, problems: list[str
                 problems.append(f"{prefix}{key} is {value!r}, expected {_expected(annotations[name])}")
     config = cls(**arguments)
     for entry in dataclasses.fields(config):  # type: ignore[arg-type]
-        minimum, value = entry.metadata.get("minimum"), getattr(config, entry.name)
-        if minimum is not None and value < minimum:
-            problems.append(f"{prefix}{entry.name} is {value}, expected at least {minimum}")
+        expected = _expected_instead(entry, getattr(config, entry.name))
+        if expected:
+            problems.append(f"{prefix}{entry.name} is {getattr(config, entry.name)}, expected {expected}")
     return config
+
+
+def _expected_instead(entry: dataclasses.Field, value: Any) -> str:
+    """Which numbers an option takes if it does not take this one; empty if it does, or is no number."""
+    if type(value) not in (int, float):
+        return ""
+    minimum, above, maximum = (entry.metadata.get(key) for key in ("minimum", "above", "maximum"))
+    if maximum is None and type(value) is int:
+        maximum = LARGEST_INT
+    if not math.isfinite(value):
+        return "a finite number"
+    if minimum is not None and value < minimum:
+        return f"at least {minimum}"
+    if above is not None and value <= above:
+        return f"more than {above}"
+    return f"at most {maximum}" if maximum is not None and value > maximum else ""
 
 
 def load_pipeline(path: Path) -> PipelineConfig:

@@ -57,6 +57,31 @@ def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> N
         assert part in text
 
 
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[prune]\nmax_error_px = 0", "prune.max_error_px is 0.0, expected more than 0"),
+        ("[database]\nverification_error_px = 0.0", "verification_error_px is 0.0, expected more than 0"),
+        ("[prune]\nmax_ratio = nan", "prune.max_ratio is nan, expected a finite number"),
+        ("[pairs]\nmax_distance_m = inf", "pairs.max_distance_m is inf, expected a finite number"),
+        ("[run]\nseed = 2147483648", "run.seed is 2147483648, expected at most 2147483647"),
+        ("[features]\nmax_features = 5000000000", "max_features is 5000000000, expected at most 2147483647"),
+        ("[run]\nthreads = 100000", "run.threads is 100000, expected at most 1024"),
+        ("[reconstruction]\nmax_runtime_minutes = 1e9", "expected at most 35791394"),
+    ],
+)
+def test_numbers_that_a_stage_would_choke_on_are_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        cfg.load_pipeline(path)
+    assert message in str(error.value)
+
+
+def test_the_largest_seed_is_valid() -> None:
+    assert cfg.from_dict(cfg.RunConfig, {"seed": 2147483647}, "here").seed == 2147483647
+
+
 @pytest.mark.parametrize("text", ["[features", "features = 3", "[features]\nroot_sift = 1"])
 def test_broken_pipeline_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "p.toml"
