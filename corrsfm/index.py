@@ -48,7 +48,10 @@ class Index:
 
 
 class PhotoCache:
-    """Hashes and headers of photos, remembered as long as size and modification time stay the same.
+    """Hashes and headers of photos, remembered as long as the file stays the same.
+
+    The same means its size, the times of its content and of its entry, and its number in the file system: a
+    copy over it or a swap may keep the first two.
 
     Reading them decodes every photo, which a resumed run of thousands of photos should not do again.
 
@@ -80,8 +83,8 @@ class PhotoCache:
             stat = path.stat()
         except OSError:  # a broken link; what reads it says so
             return compute(path)
-        name = str(path)
-        stamp = [stat.st_size, stat.st_mtime_ns]
+        name = str(path.resolve())
+        stamp = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
         known = self._known.get(name)
         entry = self._kept.setdefault(name, known if known and known["stamp"] == stamp else {"stamp": stamp})
         if key not in entry:
@@ -155,7 +158,9 @@ def read_pairs(workspace: Workspace) -> PairList:
     """
     path = workspace.pair_origins
     try:
-        rows = [line.split("\t") for line in path.read_text(encoding="utf-8").splitlines()]
+        # Not splitlines, which also ends a line at characters that a name may hold.
+        lines = path.read_text(encoding="utf-8").split("\n")
+        rows = [line.split("\t") for line in lines if line]
         return PairList(
             pairs=tuple((name0, name1) for name0, name1, _ in rows),
             origins=tuple(tuple(origin.split(",")) for _, _, origin in rows),
