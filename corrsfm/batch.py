@@ -1,27 +1,37 @@
 """Many scenes: every one a process of its own, on this machine or on an existing Dask cluster.
 
 A scene that fails does not stop the others, and running the batch again goes on where each scene stopped,
-because `corrsfm run` does.
+because `corrsfm run` does. An interrupted batch ends the scenes that run on this machine; those that a Dask
+worker has begun go on to their end.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
+import itertools
 import json
+import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
+from corrsfm.config import load_pipeline
 from corrsfm.errors import DependencyError, InputError
+from corrsfm.machine import count_threads
 
 __all__ = ["SceneStatus", "find_scenes", "run_collection"]
 
 LOG_NAME = "batch.log"
+GRACE_SECONDS = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +46,7 @@ class SceneStatus:
     message : str
         The error, if there was one.
     statistics : dict
-        Counts from the scene's `report.json`; empty if it has none.
+        The numbers of the summary in the scene's `report.json`; empty if it has none.
     """
 
     scene: str
@@ -46,8 +56,14 @@ class SceneStatus:
     statistics: dict[str, float] = field(default_factory=dict)
 
 
-def find_scenes(collection: Path) -> dict[str, Path]:
+def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str, Path]:
     """Scenes of a collection: the sub-folders, or their folder `images` where they have one.
+
+    Parameters
+    ----------
+    collection : Path
+    leave_out : Path, optional
+        A sub-folder that is no scene.
 
     Returns
     -------
@@ -61,10 +77,11 @@ def find_scenes(collection: Path) -> dict[str, Path]:
     """
     if not collection.is_dir():
         raise InputError(f"{collection}: not a folder; expected one with a sub-folder for each scene")
+    other = leave_out.resolve() if leave_out is not None else None
     scenes = {
         folder.name: folder / "images" if (folder / "images").is_dir() else folder
         for folder in sorted(collection.iterdir())
-        if folder.is_dir() and not folder.name.startswith(".")
+        if folder.is_dir() and not folder.name.startswith(".") and folder.resolve() != other
     }
     if not scenes:
         raise InputError(f"{collection}: no sub-folders; expected one for each scene")
@@ -85,7 +102,8 @@ def run_collection(
     arguments : sequence of str
         Further arguments of `corrsfm run`.
     jobs : int
-        Scenes at a time on this machine.
+        Scenes at a time on this machine. They share its cores evenly, unless the arguments, or a pipeline
+        file among them, say how many threads each may use.
     dask : str, optional
         Address of a Dask scheduler whose workers see the same files; they run the scenes then.
 
@@ -93,22 +111,101 @@ def run_collection(
     -------
     list of SceneStatus
         Sorted by scene.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        On Ctrl-C or SIGTERM, after the scenes under way have been ended; the same call goes on from there.
     """
-    scenes = find_scenes(collection)
+    scenes = find_scenes(collection, leave_out=output)
     output.mkdir(parents=True, exist_ok=True)
     statuses = []
-    with _executor(jobs, dask) as executor:
-        waiting = [
-            executor.submit(
-                run_one, scene, str(images.resolve()), str((output / scene).resolve()), list(arguments)
-            )
-            for scene, images in scenes.items()
-        ]
-        with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
-            for future in as_completed(waiting):
-                statuses.append(future.result())
-                bar.update()
+    processes = _Processes()
+    # A Dask worker cannot be sent the processes of this machine.
+    work: Callable[..., SceneStatus] = run_one
+    if dask is None:
+        work = functools.partial(run_one, call=processes.call)
+    threads = _threads_argument(arguments, min(jobs, len(scenes))) if dask is None else []
+    waiting = []
+    with _terminable(), _executor(jobs, dask) as executor:
+        try:
+            for scene, images in scenes.items():
+                places = str(images.resolve()), str((output / scene).resolve())
+                waiting.append(executor.submit(work, scene, *places, [*threads, *arguments]))
+            with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
+                for future in as_completed(waiting):
+                    statuses.append(future.result())
+                    bar.update()
+        except BaseException:
+            for future in waiting:
+                future.cancel()
+            processes.end()
+            raise
     return sorted(statuses, key=lambda status: status.scene)
+
+
+def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
+    """What gives each of several scenes at a time its share of the cores, unless the user chose."""
+    if jobs == 1 or any(argument.split("=")[0] == "--threads" for argument in arguments):
+        return []
+    for argument, following in itertools.pairwise([*arguments, ""]):
+        flag, _, value = argument.partition("=")
+        if flag == "--pipeline" and load_pipeline(Path(value or following)).run.threads:
+            return []
+    return ["--threads", str(max(1, count_threads(0) // jobs))]
+
+
+class _Processes:
+    """The processes of the scenes on this machine, to be ended together."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._running: set[subprocess.Popen] = set()
+        self._ended = False
+
+    def call(self, command: Sequence[str], **streams: Any) -> int:
+        """As `subprocess.call`; starts nothing any more once all have been ended."""
+        with self._lock:
+            if self._ended:
+                return -signal.SIGTERM
+            process = subprocess.Popen(command, **streams)
+            self._running.add(process)
+        try:
+            return process.wait()
+        finally:
+            with self._lock:
+                self._running.discard(process)
+
+    def end(self) -> None:
+        """End all processes, those that do not listen by force."""
+        with self._lock:
+            self._ended = True
+            running = list(self._running)
+        for process in running:
+            process.terminate()
+        deadline = time.monotonic() + GRACE_SECONDS
+        for process in running:
+            try:
+                process.wait(max(0.0, deadline - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """Make SIGTERM an interruption, which would end this process alone and leave its scenes running."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may
+        yield
+        return
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _executor(jobs: int, dask: str | None) -> Executor:
@@ -121,28 +218,39 @@ def _executor(jobs: int, dask: str | None) -> Executor:
     return Client(dask).get_executor(pure=False)
 
 
-def run_one(scene: str, images: str, workspace: str, arguments: list[str]) -> SceneStatus:
+def run_one(
+    scene: str,
+    images: str,
+    workspace: str,
+    arguments: list[str],
+    *,
+    call: Callable[..., int] = subprocess.call,
+) -> SceneStatus:
     """Run one scene in a process of its own; its output goes to `batch.log` beside its workspace."""
     started = time.monotonic()
     log = Path(f"{workspace}.{LOG_NAME}")
     command = [sys.executable, "-m", "corrsfm", "--quiet", "run", images, workspace, *arguments]
     with open(log, "w", encoding="utf-8") as handle:
-        code = subprocess.run(
-            command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL
-        ).returncode
-    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        code = call(command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
     return SceneStatus(
         scene=scene,
         succeeded=code == 0,
         seconds=round(time.monotonic() - started, 1),
-        message="" if code == 0 else lines[-1] if lines else f"ended with code {code}",
+        message="" if code == 0 else _last_error(log) or f"ended with code {code}",
         statistics=_statistics(Path(workspace) / "report.json"),
     )
 
 
+def _last_error(log: Path) -> str:
+    """The last error in a log with all its lines, or else its last line."""
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    starts = [number for number, line in enumerate(lines) if line.startswith("Error:")]
+    return "\n".join(lines[starts[-1] if starts else -1 :])
+
+
 def _statistics(report: Path) -> dict[str, float]:
     try:
-        values = json.loads(report.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        values = json.loads(report.read_text(encoding="utf-8"))["summary"]
+    except (OSError, ValueError, KeyError, TypeError):
         return {}
     return {key: value for key, value in values.items() if isinstance(value, int | float)}

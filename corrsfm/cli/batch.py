@@ -15,7 +15,13 @@ __all__ = ["batch"]
 @click.argument("collection", type=click.Path(path_type=Path))
 @click.argument("output", type=click.Path(path_type=Path))
 @click.argument("run_arguments", nargs=-1, type=click.UNPROCESSED)
-@click.option("--jobs", type=click.IntRange(min=1), default=1, show_default=True, help="Scenes at a time.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="Scenes at a time; they share the cores, unless --threads says otherwise.",
+)
 @click.option("--dask", metavar="ADDRESS", help="Dask scheduler whose workers run the scenes instead.")
 @json_option
 def batch(
@@ -34,7 +40,8 @@ def batch(
     else:
         for status in statuses:
             result = "ok    " if status.succeeded else "FAILED"
-            click.echo(f"{status.scene:<24} {result} {status.seconds:8.1f} s  {status.message}")
+            message = status.message.replace("\n", "\n    ")
+            click.echo(f"{status.scene:<24} {result} {status.seconds:8.1f} s  {message}")
     failed = sum(not status.succeeded for status in statuses)
     if failed:
         raise click.ClickException(

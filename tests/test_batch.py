@@ -1,0 +1,132 @@
+"""Many scenes: what a batch says of each, how they share the machine, and how it ends."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from photos import write_photos
+
+from corrsfm import batch
+from corrsfm.batch import find_scenes, run_collection, run_one
+from corrsfm.report import make_report
+
+
+def collection(root: Path, *scenes: str) -> Path:
+    for scene in scenes:
+        (root / "collection" / scene).mkdir(parents=True)
+    return root / "collection"
+
+
+def stand_in(root: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    """Let a shell script, called like Python, take the place of the scenes' processes."""
+    path = root / "stand-in"
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(path))
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_batch_ends_its_scenes_and_starts_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    stand_in(tmp_path, monkeypatch, 'echo $$ > "$6.pid"; exec sleep 60')
+    out = tmp_path / "out"
+
+    def interrupt() -> None:
+        while not all((out / f"{scene}.pid").exists() for scene in "ab") and time.monotonic() < started + 20:
+            time.sleep(0.02)
+        os.kill(os.getpid(), number)
+
+    before = signal.getsignal(signal.SIGTERM)
+    started = time.monotonic()
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        run_collection(collection(tmp_path, *"abcd"), out, jobs=2)
+    assert time.monotonic() - started < 30
+    assert signal.getsignal(signal.SIGTERM) == before
+    assert sorted(path.name for path in out.glob("*.pid")) == ["a.pid", "b.pid"]
+    for path in out.glob("*.pid"):
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.read_text()), 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "jobs", "given"),
+    [
+        ([], 1, []),
+        ([], 2, ["--threads", "4"]),
+        ([], 3, ["--threads", "2"]),
+        (["--seed", "1"], 99, ["--threads", "2", "--seed", "1"]),
+        (["--threads", "5"], 2, ["--threads", "5"]),
+        (["--threads=5"], 2, ["--threads=5"]),
+        (["--pipeline", "chosen.toml"], 2, ["--pipeline", "chosen.toml"]),
+        (["--pipeline=open.toml"], 2, ["--threads", "4", "--pipeline=open.toml"]),
+    ],
+)
+def test_scenes_at_a_time_share_the_cores_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], jobs: int, given: list[str]
+) -> None:
+    monkeypatch.setattr(batch, "count_threads", lambda wanted: wanted or 8)
+    monkeypatch.chdir(tmp_path)
+    Path("chosen.toml").write_text("[run]\nthreads = 3\n")
+    Path("open.toml").write_text("[run]\nseed = 3\n")
+    stand_in(tmp_path, monkeypatch, 'shift 6; echo "$@" > "$0.$$"')
+    statuses = run_collection(collection(tmp_path, *"abc"), tmp_path / "out", arguments, jobs=jobs)
+    assert [(status.scene, status.succeeded) for status in statuses] == [(s, True) for s in "abc"]
+    assert [path.read_text().split() for path in tmp_path.glob("stand-in.*")] == [given] * 3
+
+
+def test_the_statistics_are_the_numbers_of_the_reports_summary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = make_report(scene="a", image_names=["0.png", "1.png"], pairs=[], models=[])
+    (tmp_path / "out" / "a").mkdir(parents=True)
+    (tmp_path / "out" / "a" / "report.json").write_text(json.dumps(report.to_dict()))
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    (status,) = run_collection(collection(tmp_path, "a"), tmp_path / "out")
+    assert status.statistics["num_images"] == 2
+    assert status.statistics["num_registered"] == status.statistics["num_models"] == 0
+    assert "format_version" not in status.statistics
+
+
+def test_the_message_is_the_whole_last_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(
+        tmp_path,
+        monkeypatch,
+        "printf 'warning: x\\nError: old\\nError: 1.png: empty\\n2.png: cut\\n'; exit 1",
+    )
+    (status,) = run_collection(collection(tmp_path, "a"), tmp_path / "out")
+    assert not status.succeeded
+    assert status.message == "Error: 1.png: empty\n2.png: cut"
+
+
+@pytest.mark.parametrize(
+    ("script", "message"), [("echo Killed; exit 9", "Killed"), ("exit 9", "ended with code 9")]
+)
+def test_without_an_error_the_message_is_what_there_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, message: str
+) -> None:
+    stand_in(tmp_path, monkeypatch, script)
+    (status,) = run_collection(collection(tmp_path, "a"), tmp_path / "out")
+    assert status.message == message
+
+
+def test_an_unreadable_photo_is_named(tmp_path: Path) -> None:
+    write_photos(tmp_path / "photos", 3)
+    (tmp_path / "photos" / "1.png").write_bytes(b"")
+    status = run_one(
+        "a", str(tmp_path / "photos"), str(tmp_path / "a"), ["--threads", "1", "--device", "cpu"]
+    )
+    assert status.message.startswith("Error: ")
+    assert "1.png: the file is empty" in status.message
+
+
+def test_workspaces_inside_the_collection_are_no_scene(tmp_path: Path) -> None:
+    root = collection(tmp_path, "a", "out")
+    assert list(find_scenes(root)) == ["a", "out"]
+    assert list(find_scenes(root, leave_out=root / "a" / ".." / "out")) == ["a"]
