@@ -110,6 +110,11 @@ class Journal:
         arrays = {name: value for name, value in values.items() if not name.startswith("@")}
         return arrays, {name[1:]: value.item() for name, value in values.items() if name.startswith("@")}
 
+    def num_bytes(self) -> int:
+        """Size on disk."""
+        paths = [Path(f"{self.path}{suffix}") for suffix in _SUFFIXES]
+        return sum(path.stat().st_size for path in paths if path.exists())
+
     def discard(self) -> None:
         """Delete the file and all items."""
         self.close()

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import shutil
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
@@ -403,6 +404,7 @@ class ItemStore(Generic[K, T]):
         WorkspaceError
             If an item is in neither, or the disk is full.
         """
+        self._require_space()
         try:
             with atomic_path(self.path) as temporary, h5py.File(temporary, "w") as target:
                 target.attrs["format"] = f"corrsfm-{self.kind.label}"
@@ -415,6 +417,17 @@ class ItemStore(Generic[K, T]):
                 "finished work is kept"
             ) from error
         self.discard_journal()
+
+    def _require_space(self) -> None:
+        # HDF5 may crash the process when a disk fills up while it writes. The file grows no larger than what
+        # it is made from.
+        needed = self.journal.num_bytes() + (self.path.stat().st_size if self.path.exists() else 0)
+        free = shutil.disk_usage(self.path.parent).free
+        if free < needed:
+            raise WorkspaceError(
+                f"{self.path}: writing it needs {needed / 1e6:.0f} MB, {free / 1e6:.0f} MB are free; free some "
+                "disk space and run again, finished work is kept"
+            )
 
     def _fill(
         self,

@@ -4,6 +4,7 @@ import errno
 import fcntl
 import multiprocessing
 import os
+import shutil
 import signal
 from pathlib import Path
 
@@ -317,6 +318,20 @@ def test_a_full_disk_is_reported_and_keeps_the_old_file(
     monkeypatch.undo()
     assert store.finished({"a": "1", "b": "1"}) == {"a", "b"}
     assert not list(store.path.parent.glob("*.partial"))
+
+
+def test_a_disk_that_would_fill_up_is_not_written_to(
+    store: ItemStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # HDF5 may crash the process instead of raising an error.
+    store.add("a", "1", make_features(1000))
+    usage = shutil.disk_usage(store.path.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=100_000))
+        with pytest.raises(WorkspaceError, match=r"needs \d+ MB, 0 MB are free; free some disk space"):
+            store.commit({"a": "1"})
+    store.commit({"a": "1"})
+    assert len(store.read("a")) == 1000
 
 
 def test_names_that_hloc_cannot_tell_apart_are_refused() -> None:
