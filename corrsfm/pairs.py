@@ -7,6 +7,7 @@ records which strategies proposed each pair.
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
 import shlex
 from collections import defaultdict
@@ -34,6 +35,8 @@ __all__ = [
     "sequential_pairs",
     "spatial_pairs",
 ]
+
+logger = logging.getLogger("corrsfm")
 
 IndexPairs = set[tuple[int, int]]
 """Pairs of photo indices, the smaller first."""
@@ -83,6 +86,10 @@ def make_pairs(
     strategies = _resolve(config.pairing, len(names))
     retrieved: IndexPairs | None = None
     loop_closure = config.loop_closure and PairStrategy.SEQUENTIAL in strategies
+    if config.loop_closure and not loop_closure:
+        logger.warning(
+            "--loop-closure adds to --pairing sequential only, which is not chosen: %s", ", ".join(strategies)
+        )
     if loop_closure or PairStrategy.RETRIEVAL in strategies:
         retrieved = retrieval_pairs(names, config.num_retrieved, load_features=load_features, seed=seed)
     proposals: dict[str, IndexPairs] = {}

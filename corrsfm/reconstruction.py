@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +22,8 @@ from corrsfm.types import ModelSummary
 __all__ = ["reconstruct"]
 
 _POLL_SECONDS = 0.2
+
+logger = logging.getLogger("corrsfm")
 
 
 def reconstruct(
@@ -77,6 +81,8 @@ def reconstruct(
         scratch = temporary / "mapper"
         scratch.mkdir(parents=True)
         pycolmap.set_random_seed(seed)
+        _warn_of_unused(config)
+        started = time.monotonic()
         # pycolmap insists on an existing folder even if no photo is read.
         mapped = _run_mapper(
             database,
@@ -86,9 +92,12 @@ def reconstruct(
             options=_incremental_options(config, output, seed, num_threads),
             on_progress=on_progress or (lambda num_registered: None),
         )
+        cut_off = _cut_off(config, time.monotonic() - started)
         models = _ranked(mapped.values(), config.min_model_size)
         if not models:
-            raise ReconstructionError(f"{database}: {_why_no_model(graph)}")
+            raise ReconstructionError(f"{database}: {_why_no_model(graph, cut_off)}")
+        if cut_off:
+            logger.warning("%s; photos may be missing for that reason alone", cut_off)
         for number, model in enumerate(models):
             if images_dir is not None and config.mapper is not Mapper.INCREMENTAL:
                 model.extract_colors_for_all_images(images_dir)
@@ -96,6 +105,33 @@ def reconstruct(
             model.write_binary(temporary / str(number))
         shutil.rmtree(scratch)
         return [summarise_model(model) for model in models]
+
+
+def _warn_of_unused(config: ReconstructionConfig) -> None:
+    """Say which options the chosen mapper does not heed."""
+    if config.mapper is not Mapper.GLOBAL:
+        return
+    for flag, value in (
+        ("--max-runtime-minutes", config.max_runtime_minutes),
+        ("--snapshot-every", config.snapshot_every),
+    ):
+        if value:
+            logger.warning("%s %g has no effect with --mapper global", flag, value)
+
+
+def _cut_off(config: ReconstructionConfig, seconds: float) -> str:
+    """That mapping was stopped before its end, if it was; pycolmap itself tells its log only."""
+    limit = _max_runtime_seconds(config)
+    if config.mapper is Mapper.GLOBAL or not limit or seconds < limit:
+        return ""
+    # Hierarchical mapping gives each of its parts so long.
+    stopped = "was stopped" if config.mapper is Mapper.INCREMENTAL else "may have been stopped"
+    return f"mapping {stopped} after --max-runtime-minutes {config.max_runtime_minutes:g}"
+
+
+def _max_runtime_seconds(config: ReconstructionConfig) -> int:
+    """0 for no limit."""
+    return max(1, round(60 * config.max_runtime_minutes)) if config.max_runtime_minutes > 0 else 0
 
 
 def _incremental_options(
@@ -109,8 +145,8 @@ def _incremental_options(
     options.ba_refine_principal_point = config.refine_principal_point
     options.num_threads = num_threads or -1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    if config.max_runtime_minutes > 0:
-        options.max_runtime_seconds = max(1, round(60 * config.max_runtime_minutes))
+    if limit := _max_runtime_seconds(config):
+        options.max_runtime_seconds = limit
     if config.snapshot_every:
         snapshots = output.with_name("snapshots")
         snapshots.mkdir(parents=True, exist_ok=True)
@@ -248,8 +284,8 @@ def _read_pair_graph(database: Path) -> _PairGraph:
         )
 
 
-def _why_no_model(graph: _PairGraph) -> str:
-    """The reason for an empty result, drawn from the graph of verified pairs."""
+def _why_no_model(graph: _PairGraph, cut_off: str = "") -> str:
+    """The reason for an empty result, drawn from the graph of verified pairs unless mapping was cut off."""
 
     def best(counts: dict[int, int]) -> str:
         pair = max(counts, key=lambda pair: (counts[pair], -pair))
@@ -272,6 +308,8 @@ def _why_no_model(graph: _PairGraph) -> str:
             f"{best(graph.num_matches)}; try photos that overlap more, more features or a lower "
             "--min-num-inliers"
         )
+    if cut_off:
+        return f"{nothing}{cut_off}; allow more time"
     return (
         f"{nothing}{len(graph.num_inliers)} of {graph.num_recorded} pairs are verified, the best is "
         f"{best(graph.num_inliers)} matches, but no two photos make a good start: their matches are too few "

@@ -130,14 +130,18 @@ def test_auto_is_exhaustive_for_small_scenes_and_retrieval_for_large_ones() -> N
     assert len(large) <= 201 * 4
 
 
-def test_loop_closure_adds_retrieval_pairs_to_a_sequence_only() -> None:
+def test_loop_closure_adds_retrieval_pairs_to_a_sequence_only(caplog: pytest.LogCaptureFixture) -> None:
     config = PairsConfig(pairing=(SEQUENTIAL,), sequential_overlap=1, loop_closure=True, num_retrieved=2)
     # The made-up descriptors repeat after 25 frames.
     pair_list = make_pairs(video(50), config, load_features=load)
     origins = dict(zip(pair_list.pairs, pair_list.origins, strict=True))
     assert "loop-closure" in origins["img0.jpg", "img25.jpg"]
     assert all("sequential" in origins[tuple(sorted((f"img{i}.jpg", f"img{i + 1}.jpg")))] for i in range(49))
+    assert not caplog.messages
     exhaustive = make_pairs(video(5), PairsConfig(loop_closure=True))
+    assert caplog.messages == [
+        "--loop-closure adds to --pairing sequential only, which is not chosen: exhaustive"
+    ]
     assert set(exhaustive.origins) == {("exhaustive",)}
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from corrsfm import reconstruction
 from corrsfm.colmap import observation_errors, read_models, summarise_model
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError, WorkspaceError
@@ -87,7 +88,9 @@ def test_nothing_is_printed_and_the_log_is_kept(tmp_path: Path, capfd) -> None:
     assert "Registering image" in (tmp_path / "log.txt").read_text()
 
 
-def test_mapping_that_runs_out_of_time_keeps_what_there_is(tmp_path: Path) -> None:
+def test_mapping_that_runs_out_of_time_keeps_what_there_is_and_says_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     synthesize(tmp_path / "database.db")
     (summary,) = run(
         tmp_path / "database.db",
@@ -96,6 +99,42 @@ def test_mapping_that_runs_out_of_time_keeps_what_there_is(tmp_path: Path) -> No
         on_progress=lambda num_registered: time.sleep(1.1 if num_registered == 4 else 0),
     )
     assert 4 <= summary.num_images < 10
+    (text,) = caplog.messages
+    assert text.startswith("mapping was stopped after --max-runtime-minutes 0.0166667; photos may be missing")
+
+
+def test_mapping_within_its_time_says_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    synthesize(tmp_path / "database.db")
+    run(tmp_path / "database.db", tmp_path / "sparse", max_runtime_minutes=10)
+    assert not caplog.messages
+
+
+def test_no_model_for_lack_of_time_is_not_blamed_on_the_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synthesize(tmp_path / "database.db")
+    monkeypatch.setattr(reconstruction, "_run_mapper", lambda *_, **__: time.sleep(1.1) or {})
+    with pytest.raises(
+        ReconstructionError, match="was stopped after --max-runtime-minutes .*; allow more time"
+    ):
+        run(tmp_path / "database.db", tmp_path / "sparse", max_runtime_minutes=1 / 60)
+
+
+def test_options_that_the_global_mapper_does_not_heed_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    synthesize(tmp_path / "database.db")
+    run(
+        tmp_path / "database.db",
+        tmp_path / "sparse",
+        mapper=Mapper.GLOBAL,
+        snapshot_every=4,
+        max_runtime_minutes=0.5,
+    )
+    assert caplog.messages == [
+        "--max-runtime-minutes 0.5 has no effect with --mapper global",
+        "--snapshot-every 4 has no effect with --mapper global",
+    ]
 
 
 @pytest.mark.parametrize("sizes", [(4, 7), (7, 4)])
