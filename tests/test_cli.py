@@ -156,6 +156,23 @@ def test_flags_override_the_pipeline_file(tmp_path: Path, photos: Path) -> None:
     assert stages["pruned matches"]["config"]["method"] == "ratio"
 
 
+@pytest.mark.parametrize(
+    ("command", "target"),
+    [("run", "corrsfm.run.run_scene"), ("batch", "corrsfm.batch.run_collection")],
+)
+def test_an_interruption_says_how_to_go_on(
+    command: str, target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(target, interrupted)
+    plain = invoke(command, tmp_path, tmp_path / "out")
+    assert plain.exit_code == 1 and "interrupted; run the same command again to go on" in plain.stderr
+    anew = invoke(command, tmp_path, tmp_path / "out", "--overwrite")
+    assert anew.exit_code == 1 and "run the same command without --overwrite to go on" in anew.stderr
+
+
 def test_batch_goes_on_after_a_failing_scene(tmp_path: Path) -> None:
     write_photos(tmp_path / "collection" / "a", 1)
     write_photos(tmp_path / "collection" / "b" / "images", 1)

@@ -13,6 +13,7 @@ from corrsfm.cli.batch import batch
 from corrsfm.cli.bench import bench
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
+from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.train import train
 from corrsfm.errors import CorrsfmError
@@ -42,7 +43,13 @@ class _Commands(click.Group):
         except CorrsfmError as error:
             raise click.ClickException(str(error)) from error
         except KeyboardInterrupt as error:
-            raise click.ClickException("interrupted; run the same command again to go on") from error
+            raise click.ClickException(f"interrupted; {_how_to_go_on(ctx)}") from error
+
+
+def _how_to_go_on(ctx: click.Context) -> str:
+    if ctx.meta.get(OVERWRITE_KEY):
+        return "run the same command without --overwrite to go on; with it, all is done again"
+    return "run the same command again to go on"
 
 
 @click.group(

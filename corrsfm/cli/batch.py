@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from corrsfm.cli.options import echo_json, json_option
+from corrsfm.cli.options import OVERWRITE_KEY, echo_json, json_option
 
 __all__ = ["batch"]
 
@@ -34,6 +34,7 @@ def batch(
     """
     from corrsfm.batch import run_collection
 
+    click.get_current_context().meta[OVERWRITE_KEY] = "--overwrite" in run_arguments
     statuses = run_collection(collection, output, run_arguments, jobs=jobs, dask=dask)
     if as_json:
         echo_json([status.__dict__ for status in statuses])

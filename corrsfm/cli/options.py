@@ -17,6 +17,7 @@ from click.core import ParameterSource
 from corrsfm import config as cfg
 
 __all__ = [
+    "OVERWRITE_KEY",
     "config_options",
     "echo_json",
     "json_option",
@@ -25,6 +26,9 @@ __all__ = [
     "recipe_options",
     "run_options",
 ]
+
+# Where an invocation notes that finished work is to be redone.
+OVERWRITE_KEY = "corrsfm.overwrite"
 
 F = typing.TypeVar("F", bound=Callable[..., Any])
 
@@ -66,7 +70,7 @@ def config_options(**configs: type) -> Callable[[F], F]:
     Raises
     ------
     ConfigError
-        If a value is below its minimum, naming all of them.
+        If a value is out of its range, naming all of them.
     """
 
     def decorate(command: F) -> F:
@@ -156,9 +160,15 @@ def run_options(command: F) -> F:
 
 def overwrite_option(command: F) -> F:
     """``--overwrite``; without it finished work is kept."""
+
+    def note(context: click.Context, _: click.Parameter, value: bool) -> bool:
+        context.meta[OVERWRITE_KEY] = value
+        return value
+
     return click.option(
         "--overwrite",
         is_flag=True,
+        callback=note,
         help="Redo finished work; without it only what is missing or stale is done.",
     )(command)
 
