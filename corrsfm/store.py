@@ -425,8 +425,8 @@ class ItemStore(Generic[K, T]):
         free = shutil.disk_usage(self.path.parent).free
         if free < needed:
             raise WorkspaceError(
-                f"{self.path}: writing it needs {needed / 1e6:.0f} MB, {free / 1e6:.0f} MB are free; free some "
-                "disk space and run again, finished work is kept"
+                f"{self.path}: writing it needs {needed / 1e6:.0f} MB, {free / 1e6:.0f} MB are free; "
+                "free some disk space and run again, finished work is kept"
             )
 
     def _fill(
