@@ -17,7 +17,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ __all__ = ["SceneStatus", "find_scenes", "run_collection"]
 
 LOG_NAME = "batch.log"
 GRACE_SECONDS = 10.0
+POLL_SECONDS = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,9 +134,12 @@ def run_collection(
                 places = str(images.resolve()), str((output / scene).resolve())
                 waiting.append(executor.submit(work, scene, *places, [*threads, *arguments]))
             with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
-                for future in as_completed(waiting):
-                    statuses.append(future.result())
-                    bar.update()
+                pending = set(waiting)
+                while pending:
+                    # A wait without end can miss an interruption that comes just before it.
+                    done, pending = wait(pending, POLL_SECONDS, FIRST_COMPLETED)
+                    statuses.extend(future.result() for future in done)
+                    bar.update(len(done))
         except BaseException:
             for future in waiting:
                 future.cancel()
