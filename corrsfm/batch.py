@@ -120,7 +120,7 @@ def run_collection(
     """
     scenes = find_scenes(collection, leave_out=output)
     output.mkdir(parents=True, exist_ok=True)
-    statuses = []
+    statuses: list[SceneStatus] = []
     processes = _Processes()
     # A Dask worker cannot be sent the processes of this machine.
     work: Callable[..., SceneStatus] = run_one
