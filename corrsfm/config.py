@@ -243,7 +243,13 @@ class DatabaseConfig:
     """Geometric verification inside the COLMAP database."""
 
     min_num_inliers: int = option(15, "Fewest verified matches of a pair that mapping may use", minimum=1)
-    verification_error_px: float = option(4.0, "Inlier threshold of the verification", unit="px", above=0)
+    verification_error_px: float = option(
+        0.0,
+        "Inlier threshold of the verification; 0 for 2 px with photos of up to 1,000 px, more with larger "
+        "ones, at most COLMAP's 4 px",
+        unit="px",
+        minimum=0,
+    )
     write_descriptors: bool = option(False, "Also write descriptors, for tools that need them")
 
 
@@ -254,6 +260,10 @@ class ReconstructionConfig:
     mapper: Mapper = option(Mapper.INCREMENTAL, "Mapping pipeline")
     min_model_size: int = option(3, "Smallest model worth keeping", unit="photos", minimum=2)
     multiple_models: bool = option(True, "Keep several models when the photos do not connect")
+    refine_intrinsics: bool = option(
+        True,
+        "Estimate focal lengths and distortion; without, those of --camera-params or EXIF stay as they are",
+    )
     refine_principal_point: bool = option(False, "Also estimate the principal point")
     snapshot_every: int = option(
         0, "Write a snapshot every so many registered photos; 0 for none", minimum=0, affects_result=False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import shutil
 import threading
@@ -13,6 +14,7 @@ from typing import Any
 
 import pycolmap
 
+from corrsfm.calibration import focal_length_ratios, is_plausible, refine_intrinsics
 from corrsfm.colmap import colmap_log, database_errors, summarise_model
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError
@@ -92,6 +94,7 @@ def reconstruct(
             options=_incremental_options(config, output, seed, num_threads),
             on_progress=on_progress or (lambda num_registered: None),
         )
+        _check_calibration(mapped.values())
         cut_off = _cut_off(config, time.monotonic() - started)
         models = _ranked(mapped.values(), config.min_model_size)
         if not models:
@@ -142,6 +145,7 @@ def _incremental_options(
     options.min_num_matches = 1
     options.min_model_size = config.min_model_size
     options.multiple_models = config.multiple_models
+    options.ba_refine_focal_length = options.ba_refine_extra_params = config.refine_intrinsics
     options.ba_refine_principal_point = config.refine_principal_point
     options.num_threads = num_threads or -1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
@@ -165,7 +169,13 @@ def _run_mapper(
     on_progress: Callable[[int], None],
 ) -> dict[int, pycolmap.Reconstruction]:
     if config.mapper is Mapper.INCREMENTAL:
-        return _map_incrementally(database, images_dir, scratch, options, on_progress)
+        mapped = _map_incrementally(database, images_dir, scratch, options, on_progress)
+        largest = _largest(mapped.values())
+        if largest is None or is_plausible(largest) or not config.refine_intrinsics:
+            return mapped
+        logger.info("focal lengths that cannot be: mapping once more, with all of them held until the end")
+        again = _map_with_held_intrinsics(database, images_dir, scratch, options, on_progress)
+        return again if _explains_more(_largest(again.values()), largest) else mapped
     if config.mapper is Mapper.GLOBAL:
         general = pycolmap.GlobalPipelineOptions()
         general.min_num_matches = options.min_num_matches
@@ -176,7 +186,9 @@ def _run_mapper(
         general.mapper.rotation_averaging.random_seed = options.random_seed
         general.mapper.global_positioning.random_seed = options.random_seed
         general.mapper.retriangulation.random_seed = options.random_seed
-        general.mapper.bundle_adjustment.refine_principal_point = config.refine_principal_point
+        adjustment = general.mapper.bundle_adjustment
+        adjustment.refine_focal_length = adjustment.refine_extra_params = config.refine_intrinsics
+        adjustment.refine_principal_point = config.refine_principal_point
         return _interruptible(pycolmap.global_mapping, database, images_dir, scratch, general)
     clusters = pycolmap.HierarchicalPipelineOptions()
     clusters.num_threads = options.num_threads
@@ -211,6 +223,53 @@ def _map_incrementally(
         initial_image_pair_callback=start,
         next_image_callback=grow,
     )
+
+
+def _map_with_held_intrinsics(
+    database: Path,
+    images_dir: Path,
+    scratch: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+    on_progress: Callable[[int], None],
+) -> dict[int, pycolmap.Reconstruction]:
+    """Map with focal lengths and distortion held, then refine them in the whole models."""
+    held = copy.deepcopy(options)
+    held.ba_refine_focal_length = held.ba_refine_extra_params = held.ba_refine_principal_point = False
+    (scratch / "held").mkdir()
+    mapped = _map_incrementally(database, images_dir, scratch / "held", held, on_progress)
+    for model in mapped.values():
+        refine_intrinsics(
+            model,
+            refine_principal_point=options.ba_refine_principal_point,
+            num_threads=max(options.num_threads, 0),
+        )
+    return mapped
+
+
+def _largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction) -> bool:
+    """Whether a model registers more photos than another, or as many and sees more of its points."""
+
+    def size(one: pycolmap.Reconstruction) -> tuple[int, int]:
+        return one.num_reg_images(), one.compute_num_observations()
+
+    return model is not None and size(model) > size(other)
+
+
+def _check_calibration(models: Iterable[pycolmap.Reconstruction]) -> None:
+    """Warn of a model that no cameras can have taken."""
+    model = _largest(models)
+    if model is not None and not is_plausible(model):
+        ratios = focal_length_ratios(model)
+        logger.warning(
+            "the model looks wrong: focal lengths from %.2g to %.2g times the longest side of photos that do "
+            "not tell them in EXIF; if one camera took all, try --camera-mode single, else --mapper global",
+            ratios[0],
+            ratios[-1],
+        )
 
 
 def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:

@@ -26,6 +26,7 @@ LAYERS: dict[str, int] = {
     "journal": 1,
     "machine": 1,
     "colmap": 1,
+    "calibration": 1,
     "oanet": 1,
     "compact": 1,
     "model": 1,
@@ -71,8 +72,8 @@ OWNERS: dict[str, set[str]] = {
     "cv2": {"images", "features", "report", "prune", "evaluation"},
     "h5py": {"store", "oanet", "compact", "training"},
     "pycolmap": {
-        "cameras", "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "evaluation", "training",
+        "calibration", "cameras", "colmap", "images", "features", "pairs", "prune", "database",
+        "reconstruction", "report", "evaluation", "training",
     },
     "torch": {"model", "machine", "matches", "prune", "benchmark", "training", "evaluation"},
     "click": {"cli"},

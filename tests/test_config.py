@@ -61,7 +61,6 @@ def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> N
     ("text", "message"),
     [
         ("[prune]\nmax_error_px = 0", "prune.max_error_px is 0.0, expected more than 0"),
-        ("[database]\nverification_error_px = 0.0", "verification_error_px is 0.0, expected more than 0"),
         ("[prune]\nmax_ratio = nan", "prune.max_ratio is nan, expected a finite number"),
         ("[pairs]\nmax_distance_m = inf", "pairs.max_distance_m is inf, expected a finite number"),
         ("[run]\nseed = 2147483648", "run.seed is 2147483648, expected at most 2147483647"),

@@ -1,5 +1,6 @@
 """The COLMAP database."""
 
+import dataclasses
 import subprocess
 import sys
 import time
@@ -11,7 +12,12 @@ import pytest
 
 from corrsfm.colmap import colmap_log, database_errors
 from corrsfm.config import DatabaseConfig
-from corrsfm.database import DatabaseSummary, read_verified_pairs, write_database
+from corrsfm.database import (
+    DatabaseSummary,
+    default_verification_error_px,
+    read_verified_pairs,
+    write_database,
+)
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.types import Camera, Features, ImageRecord, VerifiedPair
 
@@ -389,6 +395,13 @@ def test_log_goes_to_the_file_and_not_to_the_terminal(tmp_path: Path, capfd) -> 
     write(tmp_path / "database.db")
     assert capfd.readouterr() == ("", "")
     assert "geometric" in (tmp_path / "log.txt").read_text().lower()
+
+
+@pytest.mark.parametrize(("longest", "expected"), [(320, 2.0), (1000, 2.0), (1500, 3.0), (6000, 4.0)])
+def test_verification_is_stricter_with_small_photos(longest: int, expected: float) -> None:
+    cameras = [dataclasses.replace(CAMERA, height=size) for size in (300, longest, longest)]
+    cameras = [dataclasses.replace(camera, width=200) for camera in cameras]
+    assert default_verification_error_px(cameras) == pytest.approx(expected)
 
 
 def test_log_settings_of_the_process_come_back(tmp_path: Path) -> None:

@@ -373,6 +373,21 @@ def test_observation_errors_are_distances_in_pixels(tmp_path: Path) -> None:
     assert summary.median_error_px == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("mapper", [Mapper.INCREMENTAL, Mapper.GLOBAL])
+def test_known_intrinsics_can_be_kept(tmp_path: Path, mapper: Mapper) -> None:
+    synthesize(tmp_path / "database.db", camera_has_prior_focal_length=True)
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        (camera,) = database.read_all_cameras()
+        camera.params[0] *= 1.01
+        database.update_camera(camera)
+    given = list(camera.params)
+    for refine in (True, False):
+        run(tmp_path / "database.db", tmp_path / "models", mapper=mapper, refine_intrinsics=refine)
+        (model,) = read_models(tmp_path / "models")
+        (found,) = model.cameras.values()
+        assert (list(found.params) == given) is not refine
+
+
 def test_a_model_inside_a_larger_one_is_not_kept(tmp_path: Path) -> None:
     whole = synthesize(tmp_path / "database.db", num_images=6)
     part = pycolmap.Reconstruction(whole)

@@ -1,0 +1,85 @@
+"""Self-calibration: models whose focal lengths cannot be, and how to get better ones.
+
+A photo without EXIF starts from a guessed focal length, and mapping refines it from the first photos on. Few
+photos determine it badly: a focal length that runs away bends the model around it, and every later photo is
+registered to the bend. Registering with the guesses held, and refining all of them at the end, when many
+photos speak, avoids that.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+__all__ = ["focal_length_ratios", "is_plausible", "refine_intrinsics"]
+
+# COLMAP gives up a photo beyond these while it maps, but not after the last bundle adjustment.
+_SMALLEST_RATIO, _LARGEST_RATIO = 0.1, 10.0
+# Zoom lenses and crops differ by as much; that many of them in one model are rarely an accident.
+_LARGEST_FACTOR, _LARGEST_SHARE = 2.0, 0.2
+
+_REFINEMENTS = 3
+# COLMAP's own limits of a point that stays.
+_MAX_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
+
+
+def focal_length_ratios(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+    """Focal length over the longest side of every registered photo whose EXIF data does not tell it.
+
+    Returns
+    -------
+    (N,) float64
+        Sorted.
+    """
+    cameras = [image.camera for image in model.images.values() if image.has_pose]
+    return np.sort(
+        [
+            camera.mean_focal_length() / max(camera.width, camera.height)
+            for camera in cameras
+            if not camera.has_prior_focal_length
+        ]
+    ).astype(np.float64)
+
+
+def is_plausible(model: pycolmap.Reconstruction) -> bool:
+    """Whether the focal lengths that a model found for photos without EXIF can be those of cameras.
+
+    Not, if one is below a tenth or above ten times the longest side of the photo, or if more than a fifth of
+    them differ from their median by more than a factor of two.
+    """
+    ratios = focal_length_ratios(model)
+    if not len(ratios):
+        return True
+    if not (ratios[0] >= _SMALLEST_RATIO and ratios[-1] <= _LARGEST_RATIO):  # a NaN is not plausible
+        return False
+    factors = np.exp(np.abs(np.log(ratios / np.median(ratios))))
+    return bool(np.mean(factors > _LARGEST_FACTOR) <= _LARGEST_SHARE)
+
+
+def refine_intrinsics(
+    model: pycolmap.Reconstruction, *, refine_principal_point: bool = False, num_threads: int = 0
+) -> None:
+    """Refine a model, focal lengths and distortion included, and drop the points that no longer fit.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        Changed in place.
+    refine_principal_point : bool
+    num_threads : int
+        0 for all cores.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_principal_point = refine_principal_point
+    options.ceres.solver_options.num_threads = num_threads or -1
+    # `pycolmap.bundle_adjustment` does the same and turns the log to the terminal on.
+    problem = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        problem.add_image(image_id)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    for _ in range(_REFINEMENTS):
+        pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
+        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG)
+    model.update_point_3d_errors()
