@@ -284,7 +284,8 @@ class Pruner:
         if self._warned:
             return
         for pair in pairs:
-            if len(pair) < _GUARD_MIN_MATCHES:
+            # Two copies of one photo match perfectly.
+            if len(pair) < _GUARD_MIN_MATCHES or np.array_equal(pair.points0, pair.points1):
                 continue
             share = float(np.mean(pair.ratios > _GUARD_RATIO))
             if share < _GUARD_MIN_SHARE or pair.mutual.all():

@@ -84,11 +84,20 @@ def train(
     -------
     Path
         The averaged weights.
+
+    Raises
+    ------
+    ConfigError
+        If the output folder holds a run already and ``resume`` is not set.
     """
     with _process_group(torch.device(device)) as (rank, own_device):
         data = RealPairs.from_files(recipe.train.train_files, own_device, recipe.train.scene_power)
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
-        if resume and trainer.state_path.exists():
+        if trainer.state_path.exists():
+            if not resume:
+                raise ConfigError(
+                    f"{recipe.train.output}: holds a run already; go on with --resume, or choose another --output"
+                )
             trainer.load()
         return trainer.run()
 
