@@ -37,6 +37,11 @@ __all__ = [
 ]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
+# Photos that neither OpenCV nor pycolmap reads: phones' and cameras' own formats.
+_FOREIGN_SUFFIXES = (
+    ".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef", ".orf", ".pef",
+    ".raf", ".raw", ".rw2", ".srw",
+)  # fmt: skip
 
 logger = logging.getLogger("corrsfm")
 
@@ -104,7 +109,7 @@ def index_images(
         model=config.camera_model,
         params=config.camera_params,
     )
-    masks = _find_masks(config.mask_dir, names)
+    masks = _find_masks(config.mask_dir, folder, names)
     records = [
         ImageRecord(
             name=name,
@@ -151,6 +156,7 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
         names = [name for name in files if name.lower().endswith(IMAGE_SUFFIXES)]
         if mask_dir is not None:
             names = _without_masks(names, folder, mask_dir)
+        _warn_of_foreign(files, names)
         where = str(folder)
     else:
         names = _read_image_list(image_list, folder)
@@ -190,6 +196,18 @@ def _visible_files(folder: Path) -> list[str]:
     return sorted(names)
 
 
+def _warn_of_foreign(files: Sequence[str], names: Sequence[str]) -> None:
+    """Say which photos are not read; a raw photo beside the same one as JPEG is not missed."""
+    read = {PurePosixPath(name).with_suffix("") for name in names}
+    foreign = [
+        file
+        for file in files
+        if file.lower().endswith(_FOREIGN_SUFFIXES) and PurePosixPath(file).with_suffix("") not in read
+    ]
+    if foreign:
+        logger.warning("ignored %s: not readable here; convert them to JPEG first", _count_suffixes(foreign))
+
+
 def _without_masks(names: Sequence[str], folder: Path, mask_dir: Path) -> list[str]:
     """The names that are no masks."""
     masks, photos = mask_dir.resolve(), folder.resolve()
@@ -224,9 +242,10 @@ def name_remarks(names: Sequence[str]) -> list[str]:
     remarks = []
     spaced = [name for name in names if any(character.isspace() for character in name)]
     if spaced:
+        subject = "1 name contains" if len(spaced) == 1 else f"{len(spaced)} names contain"
         remarks.append(
-            f"{len(spaced)} names contain spaces, which text files of COLMAP and hloc cannot hold:"
-            f" {first_few(spaced)}"
+            f"{subject} spaces, which text files of COLMAP and hloc cannot hold: {first_few(spaced)};"
+            " rename them, or keep to corrsfm and pycolmap, which cope"
         )
     groups = defaultdict(list)
     for name in names:
@@ -239,18 +258,33 @@ def name_remarks(names: Sequence[str]) -> list[str]:
     return remarks
 
 
-def _find_masks(mask_dir: Path | None, names: Sequence[str]) -> list[str | None]:
+def _find_masks(mask_dir: Path | None, folder: Path, names: Sequence[str]) -> list[str | None]:
     """For each photo ``NAME`` the mask ``NAME.png`` if it exists; photos without one are used whole."""
     if mask_dir is None:
         return [None] * len(names)
     if not mask_dir.is_dir():
         raise InputError(f"{mask_dir}: no such folder; expected the folder with the masks")
     masks = [f"{name}.png" if (mask_dir / f"{name}.png").is_file() else None for name in names]
+    rule = f"the mask of '{names[0]}' must be '{names[0]}.png'"
     if not any(masks):
-        raise InputError(
-            f"{mask_dir}: no mask for any photo; the mask of '{names[0]}' must be '{names[0]}.png'"
-        )
+        raise InputError(f"{mask_dir}: no mask for any photo; {rule}")
+    logger.info("masks: %d of %d photos", len(masks) - masks.count(None), len(names))
+    if stray := _stray_masks(mask_dir, folder):
+        subject = "1 mask belongs" if len(stray) == 1 else f"{len(stray)} masks belong"
+        logger.warning("%s: %s to no photo: %s; %s", mask_dir, subject, first_few(stray), rule)
     return masks
+
+
+def _stray_masks(mask_dir: Path, folder: Path) -> list[str]:
+    """Pictures among the masks that are neither the mask of a file among the photos nor a photo."""
+    if folder.resolve().is_relative_to(mask_dir.resolve()):
+        return []  # the photos are among the masks: nothing tells one from the other
+    return [
+        name
+        for name in _visible_files(mask_dir)
+        if name.lower().endswith(IMAGE_SUFFIXES)
+        and not (name.endswith(".png") and (folder / name[:-4]).is_file())
+    ]
 
 
 def duplicate_images(records: Iterable[ImageRecord]) -> list[tuple[str, ...]]:
@@ -372,10 +406,13 @@ def _position(
 
 def _census(files: Sequence[str]) -> str:
     """What is in a folder instead of photos."""
+    return f"only {_count_suffixes(files)}" if files else "no visible files at all"
+
+
+def _count_suffixes(files: Sequence[str]) -> str:
+    """How many files there are of each suffix, for those that most of them have."""
     suffixes = Counter(PurePosixPath(name).suffix.lower() or "no suffix" for name in files)
-    if not suffixes:
-        return "no visible files at all"
-    return "only " + ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(5))
+    return ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(5))
 
 
 def _is_utf8(name: str) -> bool:

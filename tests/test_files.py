@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from corrsfm.errors import InputError
-from corrsfm.files import atomic_path, atomic_write_text, sha256_of
+from corrsfm.files import atomic_path, atomic_write_text, read_lines, sha256_of
 
 
 def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
@@ -44,3 +44,13 @@ def test_hash_is_the_published_one_of_known_bytes(tmp_path: Path) -> None:
 def test_file_without_a_hash_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="absent: cannot be read"):
         sha256_of(tmp_path / "absent")
+
+
+def test_a_list_that_cannot_be_read_says_why(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.txt: no such file$"):
+        read_lines(tmp_path / "none.txt")
+    with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)$"):
+        read_lines(tmp_path)
+    (tmp_path / "latin.txt").write_bytes(b"caf\xe9.jpg")
+    with pytest.raises(InputError, match=r"latin\.txt: is no UTF-8 text .*; save it as UTF-8"):
+        read_lines(tmp_path / "latin.txt")

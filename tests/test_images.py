@@ -83,7 +83,7 @@ def test_an_image_list_cannot_leave_the_folder(folder: Path, tmp_path: Path) -> 
 
 
 def test_a_missing_image_list_or_folder_is_named(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
+    with pytest.raises(InputError, match=r"none\.txt: no such file"):
         list_images(folder, image_list=tmp_path / "none.txt")
     with pytest.raises(InputError, match="nowhere: no such folder"):
         list_images(tmp_path / "nowhere")
@@ -98,6 +98,17 @@ def test_fewer_than_two_photos_are_refused_saying_what_is_there(tmp_path: Path) 
     write(tmp_path / "one.png", picture())
     with pytest.raises(InputError, match=r"the only photo is 'one\.png'"):
         list_images(tmp_path)
+
+
+def test_photos_in_formats_that_cannot_be_read_are_counted(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    list_images(folder)
+    assert not caplog.messages
+    for name in ("c.HEIC", "sub/d.heic", "e.cr2", "b.cr2"):  # b.jpg is there as well
+        (folder / name).write_bytes(b"")
+    assert len(list_images(folder)) == 4
+    assert caplog.messages == ["ignored 2 × .heic, 1 × .cr2: not readable here; convert them to JPEG first"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names themselves")
@@ -137,10 +148,12 @@ def test_remarks_name_what_other_programs_stumble_over() -> None:
     assert name_remarks(["a.jpg", "b/c.jpg"]) == []
     remarks = name_remarks(["my photo.jpg", "a/b.jpg", "a-b.jpg", "A/B.jpg"])
     assert [remark.split(":")[0] for remark in remarks] == [
-        "1 names contain spaces, which text files of COLMAP and hloc cannot hold",
+        "1 name contains spaces, which text files of COLMAP and hloc cannot hold",
         "file systems that ignore case or accents' encoding would mix up",
     ]
+    assert remarks[0].endswith(": my photo.jpg; rename them, or keep to corrsfm and pycolmap, which cope")
     assert remarks[1].endswith(": a/b.jpg, A/B.jpg")
+    assert name_remarks(["a b.jpg", "c d.jpg"])[0].startswith("2 names contain spaces")
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".bmp", ".tif", ".webp"])
@@ -286,6 +299,31 @@ def test_masks_for_no_photo_are_refused(folder: Path, tmp_path: Path) -> None:
         index_images(folder, ImagesConfig(mask_dir=tmp_path / "masks"))
     with pytest.raises(InputError, match="no such folder"):
         index_images(folder, ImagesConfig(mask_dir=tmp_path / "none"))
+
+
+@pytest.mark.parametrize("place", ["masks", "photos/masks"])
+def test_masks_are_counted_and_those_of_no_photo_named(
+    folder: Path, tmp_path: Path, place: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    masks, mask = tmp_path / place, np.zeros((48, 64), np.uint8)
+    for name in ("b.jpg", "sub/a.jpg"):
+        write(masks / f"{name}.png", mask)
+    index_images(folder, ImagesConfig(mask_dir=masks))
+    assert "masks: 2 of 4 photos" in caplog.messages
+    assert "to no photo" not in caplog.text
+    write(masks / "b.png", mask)
+    index_images(folder, ImagesConfig(mask_dir=masks))
+    expected = f"{masks}: 1 mask belongs to no photo: b.png; the mask of 'a.PNG' must be 'a.PNG.png'"
+    assert caplog.messages[-1] == expected
+
+
+def test_photos_among_the_masks_are_not_taken_for_masks(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(folder / "b.jpg.png", np.zeros((48, 64), np.uint8))
+    index_images(folder, ImagesConfig(mask_dir=folder))
+    assert "to no photo" not in caplog.text
 
 
 def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:

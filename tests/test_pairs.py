@@ -236,7 +236,7 @@ def test_a_pairs_file_with_unknown_photos_is_refused_line_by_line(tmp_path: Path
 
 
 def test_an_empty_or_missing_pairs_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match="pairs.txt: no such file"):
         read_pairs_file(tmp_path / "pairs.txt", NAMES)
     (tmp_path / "pairs.txt").write_text("# nothing\n")
     with pytest.raises(InputError, match="names no pair"):
