@@ -104,6 +104,8 @@ def assign_cameras(
     else:
         for group in groups.values():
             _warn_of_zoom([(names[index], infos[index].focal_px) for index in group])
+        if mode is CameraMode.AUTO:
+            _suggest_sharing(infos)
     cameras = [_make_camera([infos[index] for index in group], model, values) for group in groups.values()]
     position = {key: index for index, key in enumerate(groups)}
     return cameras, [position[key] for key in keys]
@@ -111,15 +113,34 @@ def assign_cameras(
 
 def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
     """Equal for photos that share a camera."""
-    has_exif = info.camera_name is not None or info.focal_px is not None
     match mode:
         case CameraMode.SINGLE:
             return ()
         case CameraMode.PER_FOLDER:
             return (PurePosixPath(name).parent.as_posix(),)
-        case CameraMode.AUTO if has_exif:
+        case CameraMode.AUTO if _has_exif(info):
             return (info.width, info.height, info.camera_name, info.focal_px)
     return (name,)
+
+
+def _has_exif(info: PhotoInfo) -> bool:
+    return info.camera_name is not None or info.focal_px is not None
+
+
+def _suggest_sharing(infos: Sequence[PhotoInfo]) -> None:
+    """Say so if photos get a camera each that may well be of one camera."""
+    sizes = Counter((info.width, info.height) for info in infos if not _has_exif(info))
+    num = sum(count for count in sizes.values() if count > 1)
+    if not num:
+        return
+    of_one_size = len({(info.width, info.height) for info in infos}) == 1
+    logger.info(
+        "%d photos of equal size tell no focal length and get a camera each; %s",
+        num,
+        "if one camera took them all, use --camera-mode single"
+        if of_one_size
+        else "put those of one camera in a folder of their own and use --camera-mode per-folder",
+    )
 
 
 def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:

@@ -31,6 +31,32 @@ def test_auto_gives_every_photo_without_exif_a_camera_of_its_own() -> None:
     assert ids_of([PLAIN, PHONE, PLAIN, PHONE], CameraMode.AUTO) == [0, 1, 2, 1]
 
 
+def test_photos_that_may_share_a_camera_are_counted_with_the_option_for_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    equal = "photos of equal size tell no focal length and get a camera each"
+    ids_of([PLAIN, PHONE, PLAIN], CameraMode.AUTO)
+    assert caplog.messages == [f"2 {equal}; if one camera took them all, use --camera-mode single"]
+    caplog.clear()
+    ids_of([PLAIN, PLAIN, PLAIN, TALL], CameraMode.AUTO)
+    (text,) = caplog.messages
+    assert text.startswith(f"3 {equal};") and text.endswith("use --camera-mode per-folder")
+
+
+def test_nothing_is_said_of_sharing_where_it_was_decided_or_cannot_be(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO")
+    ids_of([PLAIN, PHONE, TALL], CameraMode.AUTO)
+    ids_of([PLAIN, PLAIN], CameraMode.PER_IMAGE)
+    ids_of([PLAIN, PLAIN], CameraMode.SINGLE)
+    known = "500,320,240,0"
+    infos = [PLAIN, PLAIN]
+    assign_cameras(["a", "b"], infos, mode=CameraMode.AUTO, model="SIMPLE_RADIAL", params=known)
+    assert not caplog.messages
+
+
 def test_single_shares_one_camera_and_per_image_none() -> None:
     assert ids_of([PLAIN, PHONE, PLAIN], CameraMode.SINGLE) == [0, 0, 0]
     assert ids_of([PHONE, PHONE, PHONE], CameraMode.PER_IMAGE) == [0, 1, 2]
