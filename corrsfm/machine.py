@@ -48,9 +48,11 @@ def find_device(name: str) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        torch.zeros(1, device=name)
+        torch.zeros(1, device=name).cpu()  # back again, because a device "meta" holds nothing
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
+        if reason.startswith("Expected one of"):  # and then all devices that torch was ever ported to
+            reason = "there is no such device"
         raise ConfigError(
             f"--device {name}: torch {torch.__version__} cannot use it here ({reason}); "
             "try auto, cpu, cuda or cuda:0"

@@ -37,6 +37,7 @@ from corrsfm.workspace import Workspace
 
 __all__ = [
     "StageOutcome",
+    "check_options",
     "extract_features",
     "index_photos",
     "make_pairs",
@@ -97,6 +98,29 @@ def index_photos(
     outcome = StageOutcome(stage="images", num_items=len(records), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config)
     return outcome
+
+
+def check_options(run: cfg.RunConfig, prune: cfg.PruneConfig | None = None) -> None:
+    """Find out before any work whether the device, and the checkpoint of a method, can be used.
+
+    Parameters
+    ----------
+    run : RunConfig
+    prune : PruneConfig, optional
+        The method that comes later; none if matching is the last stage.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such device.
+    CheckpointError
+        If the method needs a checkpoint and it is missing or cannot be read.
+    """
+    from corrsfm.prune import build_pruner
+
+    device = find_device(run.device)
+    if prune is not None:
+        build_pruner(prune, device=device, seed=run.seed, threads=count_threads(run.threads))
 
 
 def extract_features(
@@ -359,6 +383,9 @@ def reconstruct(
     with tqdm(total=num_images, desc="mapping", unit="photo", leave=False) as bar:
 
         def on_progress(num_registered: int) -> None:
+            # Another model, or another try at the same one, begins.
+            if num_registered < bar.n:
+                bar.reset()
             bar.n = num_registered
             bar.refresh()
 

@@ -349,7 +349,7 @@ def _why_no_model(graph: _PairGraph, cut_off: str = "") -> str:
     def best(counts: dict[int, int]) -> str:
         pair = max(counts, key=lambda pair: (counts[pair], -pair))
         name0, name1 = sorted(graph.names[image] for image in pycolmap.pair_id_to_image_pair(pair))
-        return f"{name0} – {name1} with {counts[pair]}"
+        return f"{name0} – {name1} with {counts[pair]} match{'' if counts[pair] == 1 else 'es'}"
 
     nothing = "no model could be made: "
     if len(graph.names) < 2:
@@ -363,7 +363,7 @@ def _why_no_model(graph: _PairGraph, cut_off: str = "") -> str:
         )
     if not graph.num_inliers:
         return (
-            f"{nothing}none of the {graph.num_recorded} pairs passed the verification; most matches has "
+            f"{nothing}none of the {graph.num_recorded} pairs passed the verification; the best is "
             f"{best(graph.num_matches)}; try photos that overlap more, more features or a lower "
             "--min-num-inliers"
         )
@@ -371,7 +371,7 @@ def _why_no_model(graph: _PairGraph, cut_off: str = "") -> str:
         return f"{nothing}{cut_off}; allow more time"
     return (
         f"{nothing}{len(graph.num_inliers)} of {graph.num_recorded} pairs are verified, the best is "
-        f"{best(graph.num_inliers)} matches, but no two photos make a good start: their matches are too few "
+        f"{best(graph.num_inliers)}, but no two photos make a good start: their matches are too few "
         "or the camera hardly moved between them; try photos from places further apart, more features or "
         "--mapper global"
     )

@@ -51,6 +51,11 @@ class StageOutcome:
     seconds: float = 0.0
     skipped: bool = False
 
+    def __str__(self) -> str:
+        """One line for a person; the columns of several stages are aligned."""
+        state = "kept" if self.skipped else f"{self.seconds:.1f} s"
+        return f"{self.stage:<17}{self.num_items:>8}   {state}"
+
 
 def complete(
     workspace: Workspace,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import platform
 import time
 from pathlib import Path
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from corrsfm.report import SceneReport
 
 __all__ = ["run_scene"]
+
+logger = logging.getLogger("corrsfm")
 
 
 def run_scene(
@@ -42,22 +45,28 @@ def run_scene(
     CorrsfmError
         What the stages raise. If mapping fails, the report is written all the same, because it tells why.
     """
-    workspace = Workspace(workspace_dir, create=True)
     run = config.run
+    pipeline.check_options(run, config.prune)
+    workspace = Workspace(workspace_dir, create=True)
     with workspace.lock():
-        pipeline.index_photos(workspace, images_dir, config.images, run, overwrite=overwrite)
-        pipeline.extract_features(workspace, config.features, run, overwrite=overwrite)
-        pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite)
-        pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite)
-        pipeline.prune_matches(workspace, config.prune, run, overwrite=overwrite)
-        pipeline.verify_matches(workspace, config.database, run, overwrite=overwrite)
+        _say(pipeline.index_photos(workspace, images_dir, config.images, run, overwrite=overwrite))
+        _say(pipeline.extract_features(workspace, config.features, run, overwrite=overwrite))
+        _say(pipeline.make_pairs(workspace, config.pairs, run, overwrite=overwrite))
+        _say(pipeline.match_pairs(workspace, config.matches, run, overwrite=overwrite))
+        _say(pipeline.prune_matches(workspace, config.prune, run, overwrite=overwrite))
+        _say(pipeline.verify_matches(workspace, config.database, run, overwrite=overwrite))
         try:
-            pipeline.reconstruct(workspace, config.reconstruction, run, overwrite=overwrite)
-        except ReconstructionError:
+            _say(pipeline.reconstruct(workspace, config.reconstruction, run, overwrite=overwrite))
+        except ReconstructionError as error:
             pipeline.report(workspace, html=True)
-            raise
+            raise ReconstructionError(f"{error}\nevery photo and pair: {workspace.report_html}") from error
         atomic_write_json(workspace.run_json, _run_record(workspace, config))
         return pipeline.report(workspace, html=True)
+
+
+def _say(outcome: pipeline.StageOutcome) -> None:
+    """One line about a finished stage, which also stays where no progress bar is drawn."""
+    logger.info("%s", outcome)
 
 
 def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, Any]:

@@ -1,6 +1,8 @@
 """The command line: every command has help and a home, results on stdout, errors that end with a code."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import click
@@ -8,7 +10,10 @@ import pytest
 from click.testing import CliRunner, Result
 from photos import write_photos
 
+from corrsfm import config as cfg
+from corrsfm import pipeline
 from corrsfm.cli import main
+from corrsfm.errors import CheckpointError
 
 STAGE_COMMANDS = ("run", "extract", "pairs", "match", "prune", "reconstruct")
 SMALL = ["--max-features", "60", "--threads", "1", "--device", "cpu"]
@@ -168,9 +173,41 @@ def test_an_interruption_says_how_to_go_on(
 
     monkeypatch.setattr(target, interrupted)
     plain = invoke(command, tmp_path, tmp_path / "out")
-    assert plain.exit_code == 1 and "interrupted; run the same command again to go on" in plain.stderr
+    assert plain.exit_code == 130 and "interrupted; run the same command again to go on" in plain.stderr
     anew = invoke(command, tmp_path, tmp_path / "out", "--overwrite")
-    assert anew.exit_code == 1 and "run the same command without --overwrite to go on" in anew.stderr
+    assert anew.exit_code == 130 and "run the same command without --overwrite to go on" in anew.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "text"),
+    [
+        ("run", ("--device", "gpu"), "--device gpu: torch"),
+        ("run", ("--model", "nothing.pt"), "nothing.pt: no such checkpoint"),
+        ("extract", ("--device", "gpu"), "--device gpu: torch"),
+    ],
+)
+def test_what_cannot_be_used_is_found_before_any_work(
+    command: str, option: tuple[str, str], text: str, photos: Path, tmp_path: Path
+) -> None:
+    result = invoke(command, photos, tmp_path / "new", *option)
+    assert result.exit_code == 1 and text in result.stderr
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_checkpoint_that_no_method_needs_is_not_looked_for(photos: Path, tmp_path: Path) -> None:
+    pipeline.check_options(cfg.RunConfig(device="cpu"), cfg.PruneConfig(method=cfg.PruneMethod.RATIO))
+    with pytest.raises(CheckpointError):
+        pipeline.check_options(cfg.RunConfig(device="cpu"), cfg.PruneConfig(model=tmp_path / "nothing.pt"))
+
+
+def test_a_log_has_a_line_for_every_stage_and_no_progress_bars(photos: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "corrsfm", "run", photos, tmp_path / "out", "--method", "ratio", *SMALL]
+    # Whether a model comes out of such photos does not matter here.
+    text = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100).stderr
+    assert "\r" not in text
+    stages = ("images", "features", "pairs", "matches", "pruned matches", "verified matches")
+    firsts = [line[:17].strip() for line in text.splitlines()]
+    assert [first for first in firsts if first in stages] == list(stages)
 
 
 def test_batch_goes_on_after_a_failing_scene(tmp_path: Path) -> None:

@@ -21,6 +21,13 @@ def test_a_device_that_is_not_there_is_an_error_that_names_it(name: str) -> None
         find_device(name)
 
 
+@pytest.mark.parametrize("name", ["gpu", "meta"])
+def test_the_message_about_a_device_does_not_list_all_that_torch_knows(name: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        find_device(name)
+    assert len(str(caught.value)) < 150
+
+
 def test_zero_threads_means_all_that_the_process_may_have() -> None:
     assert count_threads(3) == 3
     assert 1 <= count_threads(0) <= (os.cpu_count() or 1)

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from photos import write_photo, write_photos
 
-from corrsfm import colmap, features, files, images, index, pipeline
+from corrsfm import colmap, features, files, images, index, pipeline, reconstruction
 from corrsfm import config as cfg
 from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
 from corrsfm.index import read_index, read_pairs
@@ -47,6 +47,12 @@ def run_front(
         pipeline.prune_matches(workspace, prune or cfg.PruneConfig(method=cfg.PruneMethod.RATIO), RUN),
     ]
     return {outcome.stage: (outcome.num_items, outcome.num_reused) for outcome in outcomes}
+
+
+def verify(workspace: Workspace, photos: Path) -> None:
+    """Run all stages before mapping."""
+    run_front(workspace, photos)
+    pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN)
 
 
 def contents(workspace: Workspace) -> dict[str, object]:
@@ -467,9 +473,35 @@ def test_a_failed_mapping_leaves_no_stale_model_to_take_for_new(tmp_path: Path, 
         database=cfg.DatabaseConfig(min_num_inliers=1000),
         run=RUN,
     )
-    with pytest.raises(ReconstructionError):
+    with pytest.raises(ReconstructionError, match=rf"\nevery photo and pair: {workspace.report_html}$"):
         run_scene(photos, workspace.root, config)
+    assert workspace.report_html.exists()
     assert not workspace.sparse.exists() and not workspace.run_json.exists()
     assert (workspace.root / "sparse.old" / "run.json").read_text() == "of earlier matches"
     assert '"models": []' in workspace.report_json.read_text()
     assert Workspace(workspace.root).record_of("models") is None
+
+
+def test_the_bar_of_mapping_starts_again_with_the_count(
+    workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[int | str] = []
+
+    class Bar(pipeline.tqdm):
+        def refresh(self, *arguments: object, **options: object) -> None:
+            shown.append(self.n)
+
+        def reset(self, total: float | None = None) -> None:
+            shown.append("again")
+            self.n = 0
+
+    def map_twice(*_: object, on_progress: Callable[[int], None], **__: object) -> list[object]:
+        for num_registered in (2, 3, 4, 2, 3):
+            on_progress(num_registered)
+        return []
+
+    verify(workspace, photos)
+    monkeypatch.setattr(pipeline, "tqdm", Bar)
+    monkeypatch.setattr(reconstruction, "reconstruct", map_twice)
+    pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
+    assert shown[-6:] == [2, 3, 4, "again", 2, 3]

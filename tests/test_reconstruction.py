@@ -328,7 +328,7 @@ def no_baseline(database: pycolmap.Database) -> None:
         (no_photos, Mapper.INCREMENTAL, "at least 2 photos are needed, the number of photos is 0"),
         (no_pairs, Mapper.INCREMENTAL, "no pair of photos was matched"),
         (all_pruned, Mapper.GLOBAL, "all 10 pairs were pruned to nothing"),
-        (none_verified, Mapper.HIERARCHICAL, "none of the 10 pairs passed .* with 50;"),
+        (none_verified, Mapper.HIERARCHICAL, "none of the 10 pairs passed .* with 50 matches;"),
         (
             no_baseline,
             Mapper.INCREMENTAL,

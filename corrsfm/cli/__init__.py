@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
 from typing import Any
 
@@ -31,6 +33,12 @@ class _Handler(logging.Handler):
         tqdm.write(prefix + record.getMessage(), file=sys.stderr)
 
 
+class _Interruption(click.ClickException):
+    """Ctrl-C, with the exit status that shells give it, so that scripts and schedulers can tell."""
+
+    exit_code = 128 + signal.SIGINT
+
+
 class _Commands(click.Group):
     """A group that lists its commands in the order of a reconstruction and turns errors into text."""
 
@@ -43,7 +51,7 @@ class _Commands(click.Group):
         except CorrsfmError as error:
             raise click.ClickException(str(error)) from error
         except KeyboardInterrupt as error:
-            raise click.ClickException(f"interrupted; {_how_to_go_on(ctx)}") from error
+            raise _Interruption(f"interrupted; {_how_to_go_on(ctx)}") from error
 
 
 def _how_to_go_on(ctx: click.Context) -> str:
@@ -71,9 +79,8 @@ def main(quiet: bool) -> None:
     logger = logging.getLogger("corrsfm")
     logger.handlers = [_Handler()]
     logger.setLevel(logging.WARNING if quiet else logging.INFO)
-    if quiet:
-        import os
-
+    # A bar in a file is one long line of carriage returns.
+    if quiet or not sys.stderr.isatty():
         # tqdm reads its defaults from the environment at import, which happens later.
         os.environ["TQDM_DISABLE"] = "1"
 

@@ -34,8 +34,7 @@ def _show(outcomes: Sequence[StageOutcome], as_json: bool) -> None:
         echo_json([outcome.__dict__ for outcome in outcomes])
         return
     for outcome in outcomes:
-        state = "kept" if outcome.skipped else f"{outcome.seconds:.1f} s"
-        click.echo(f"{outcome.stage:<17}{outcome.num_items:>8}   {state}")
+        click.echo(str(outcome))
 
 
 def _step(
@@ -76,6 +75,7 @@ def extract(
     from corrsfm import pipeline
     from corrsfm.workspace import Workspace
 
+    pipeline.check_options(run)
     workspace = Workspace(workspace_dir, create=True)
     with workspace.lock():
         outcomes = [
