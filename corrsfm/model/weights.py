@@ -15,7 +15,6 @@ every loading.
 from __future__ import annotations
 
 import dataclasses
-import pickle
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -212,9 +211,16 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
         )
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, OSError, RuntimeError, EOFError, ValueError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise CheckpointError(f"{file}: not a checkpoint that can be read safely ({reason})") from error
+    except OSError as error:
+        raise CheckpointError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except Exception as error:  # what the reader stumbles over in a file that is none may be anything
+        # Never torch's own text: it advises to run whatever code the file holds.
+        forbidden = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
+        reason = f"holds {forbidden[1]}" if forbidden else "is damaged, or another kind of file"
+        raise CheckpointError(
+            f"{file}: not a checkpoint that can be read safely (it {reason}); expected one of corrsfm or the "
+            "published code, with tensors and plain values only"
+        ) from error
     if not isinstance(content, dict):
         raise CheckpointError(
             f"{file}: holds a {type(content).__name__}, expected a dictionary with a 'state_dict'"
