@@ -123,11 +123,11 @@ def read_index(workspace: Workspace) -> Index:
         records = tuple(ImageRecord(**_tuples(entry, "gps")) for entry in values["images"])
     except FileNotFoundError as error:
         raise WorkspaceError(
-            f"{path}: missing; index the photos with: corrsfm extract IMAGES {workspace.root}"
+            f"{path}: missing; index the photos with: {workspace.command_for('images')}"
         ) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise WorkspaceError(
-            f"{path}: damaged ({error}); make it anew with: corrsfm extract IMAGES {workspace.root}"
+            f"{path}: damaged ({error}); make it anew with: {workspace.command_for('images')}"
         ) from error
     return Index(records=records, cameras=cameras)
 
@@ -166,6 +166,6 @@ def read_pairs(workspace: Workspace) -> PairList:
             origins=tuple(tuple(origin.split(",")) for _, _, origin in rows),
         )
     except FileNotFoundError as error:
-        raise WorkspaceError(f"{path}: missing; run: corrsfm pairs {workspace.root}") from error
+        raise WorkspaceError(f"{path}: missing; run: {workspace.command_for('pairs')}") from error
     except ValueError as error:
-        raise WorkspaceError(f"{path}: damaged; run: corrsfm pairs {workspace.root} --overwrite") from error
+        raise WorkspaceError(f"{path}: damaged; run: {workspace.command_for('pairs')} --overwrite") from error

@@ -7,9 +7,9 @@ import pytest
 
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import sha256_of
-from corrsfm.index import PhotoCache, read_pairs, write_pairs
+from corrsfm.index import PhotoCache, read_index, read_pairs, write_pairs
 from corrsfm.types import PairList
-from corrsfm.workspace import Workspace
+from corrsfm.workspace import StageRecord, Workspace
 
 
 def test_swapped_photos_of_equal_size_and_time_get_each_their_hash(tmp_path: Path) -> None:
@@ -52,5 +52,22 @@ def test_pairs_of_any_names_come_back(tmp_path: Path) -> None:
 def test_damaged_pairs_say_what_to_run(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "scene", create=True)
     workspace.pair_origins.write_text("a.jpg\tb.jpg\n")
-    with pytest.raises(WorkspaceError, match="damaged; run: corrsfm pairs .*--overwrite"):
+    workspace.finish("pairs", StageRecord(fingerprint="", config={"pairing": ["spatial"], "num_spatial": 7}))
+    command = f"corrsfm pairs {workspace.root} --pairing spatial --num-spatial 7"
+    with pytest.raises(WorkspaceError, match=f"damaged; run: {command} --overwrite$"):
         read_pairs(workspace)
+    workspace.pair_origins.unlink()
+    with pytest.raises(WorkspaceError, match=f"missing; run: {command}$"):
+        read_pairs(workspace)
+
+
+@pytest.mark.parametrize(("content", "problem"), [(None, "missing"), ("{}", "damaged")])
+def test_a_lost_index_says_how_it_was_made(tmp_path: Path, content: str | None, problem: str) -> None:
+    workspace = Workspace(tmp_path / "scene", create=True)
+    workspace.images_dir = tmp_path / "photos"
+    workspace.finish("images", StageRecord(fingerprint="", config={"camera_mode": "single"}))
+    if content is not None:
+        workspace.images_json.write_text(content)
+    command = f"corrsfm extract {tmp_path / 'photos'} {workspace.root} --camera-mode single"
+    with pytest.raises(WorkspaceError, match=f"{problem}.*: {command}$"):
+        read_index(workspace)
