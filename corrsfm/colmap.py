@@ -24,6 +24,7 @@ __all__ = [
     "colmap_log",
     "database_errors",
     "is_sqlite",
+    "is_truncated",
     "observation_errors",
     "pycolmap_version",
     "read_models",
@@ -37,6 +38,8 @@ with contextlib.suppress(ValueError):
 
 _SILENT = 3
 _SMALLEST_DISK_BYTES = 1 << 20
+_MAGIC = b"SQLite format 3\0"
+_HEADER_BYTES = 100
 
 
 def pycolmap_version() -> str:
@@ -138,19 +141,47 @@ def _explain_unopened(path: Path) -> str:
             return "is not a COLMAP database; move it away and make it again"
     if shutil.disk_usage(path.parent).free < _SMALLEST_DISK_BYTES:
         return _FULL
-    if _is_locked(path):
-        return _HELD
+    try:
+        if _is_locked(path):
+            return _HELD
+    except sqlite3.DatabaseError as error:
+        return f"damaged ({error}); delete the file and make it again"
     return "cannot be opened; check the free space of the disk and the permissions of the file and its folder"
 
 
 def is_sqlite(path: Path) -> bool:
     """Whether a file begins like an SQLite database."""
     with open(path, "rb") as file:
-        return file.read(16) == b"SQLite format 3\0"
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def is_truncated(path: Path) -> bool:
+    """Whether an SQLite database lacks bytes that its header promises; also so of an empty file.
+
+    Quick whatever the size of the file, because only the header is read; what was damaged in its place is not
+    found. False for a file that is no SQLite database at all.
+    """
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        header = file.read(_HEADER_BYTES)
+    if len(header) < _HEADER_BYTES:
+        return _MAGIC.startswith(header[: len(_MAGIC)])
+    page_size, num_pages = (int.from_bytes(header[start:end]) for start, end in ((16, 18), (28, 32)))
+    # The number of pages counts only if whoever wrote last wrote it, too.
+    counted = header[24:28] == header[92:96]
+    return (
+        header.startswith(_MAGIC) and counted and size < num_pages * (65536 if page_size == 1 else page_size)
+    )
 
 
 def _is_locked(path: Path) -> bool:
-    """Whether another process holds a lock; only asked once pycolmap has given up on the file."""
+    """Whether another process holds a lock; only asked once pycolmap has given up on the file.
+
+    Raises
+    ------
+    sqlite3.DatabaseError
+        If the file is damaged.
+    """
     try:
         with contextlib.closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True, timeout=0)) as connection:
             connection.execute("BEGIN IMMEDIATE")

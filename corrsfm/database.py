@@ -21,7 +21,13 @@ from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord, Pair, VerifiedPair
 
-__all__ = ["DatabaseSummary", "default_verification_error_px", "read_verified_pairs", "write_database"]
+__all__ = [
+    "DatabaseSummary",
+    "default_verification_error_px",
+    "names_of_verified_pairs",
+    "read_verified_pairs",
+    "write_database",
+]
 
 # Ctrl-C is obeyed between batches of pairs.
 _PAIRS_PER_BATCH = 100
@@ -202,6 +208,21 @@ def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[Verified
                 )
             )
     return sorted(verified, key=lambda pair: (pair.name0, pair.name1))
+
+
+def names_of_verified_pairs(path: Path) -> list[Pair]:
+    """The pairs with a two-view geometry, sorted; quicker than `read_verified_pairs`.
+
+    Raises
+    ------
+    DatabaseError
+        If the database cannot be read.
+    """
+    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        counts = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
+        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id, num in counts if num > 0]
+    return sorted((min(names[a], names[b]), max(names[a], names[b])) for a, b in pairs)
 
 
 def _check_not_in_use(path: Path) -> None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
-from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
+from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
@@ -29,6 +29,7 @@ from corrsfm.resume import (
     explain_photos,
     finish,
     refuse_vanished_photos,
+    require_database,
 )
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
 from corrsfm.summary import report
@@ -320,7 +321,7 @@ def verify_matches(
     workspace: Workspace, config: cfg.DatabaseConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
     """Write the COLMAP database and verify the pruned matches geometrically."""
-    from corrsfm.colmap import pycolmap_version
+    from corrsfm.colmap import is_truncated, pycolmap_version
     from corrsfm.database import write_database
 
     started = time.monotonic()
@@ -330,11 +331,16 @@ def verify_matches(
         "verified matches", pycolmap_version(), pruned.fingerprint, index.cameras, config, run.seed
     )
     pair_list = read_pairs(workspace)
-    if not overwrite and workspace.is_current("verified matches", fingerprint, workspace.database):
+    damaged = workspace.database.is_file() and is_truncated(workspace.database)
+    if damaged:
+        logger.warning("%s: damaged, its end is missing; it is written anew", workspace.database)
+    current = workspace.is_current("verified matches", fingerprint, workspace.database)
+    if current and not overwrite and not damaged:
         return StageOutcome(
             stage="verified matches", num_items=len(pair_list), num_reused=len(pair_list), skipped=True
         )
-    explain(workspace, "verified matches", config)
+    if not damaged:
+        explain(workspace, "verified matches", config)
     workspace.forget("verified matches")
     with (
         ItemStore(workspace.features, FEATURES).reader() as read_features,
@@ -372,15 +378,27 @@ def reconstruct(
     from corrsfm.reconstruction import reconstruct as map_database
 
     started = time.monotonic()
-    verified = workspace.require("verified matches")
+    verified = require_database(workspace)
     fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
-    if not overwrite and workspace.is_current("models", fingerprint, workspace.sparse / "0"):
+    # Models without colours are made again once the photos are back.
+    black = config_hash("black", fingerprint)
+    images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
+    current = [fingerprint] if images_dir else [fingerprint, black]
+    if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
     workspace.forget("models")
-    num_images = len(read_index(workspace).records)
-    with tqdm(total=num_images, desc="mapping", unit="photo", leave=False) as bar:
+    names = read_index(workspace).names
+    if images_dir is None:
+        fingerprint = black
+        logger.warning(
+            "photos are no longer at %s; the points stay black; tell where they are now with: %s",
+            workspace.images_dir,
+            workspace.command_for("images", images_dir="NEWDIR"),
+        )
+    _warn_of_parts(workspace, names)
+    with tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar:
 
         def on_progress(num_registered: int) -> None:
             # Another model, or another try at the same one, begins.
@@ -392,7 +410,7 @@ def reconstruct(
         try:
             models = map_database(
                 workspace.database,
-                workspace.images_dir,
+                images_dir,
                 workspace.sparse,
                 config=config,
                 seed=run.seed,
@@ -414,6 +432,27 @@ def _warn_if_disconnected(index: Index, pair_list: PairList) -> None:
     text = describe_components(index.names, pair_list.pairs)
     if text:
         logger.warning("%s", text)
+
+
+def _warn_of_parts(workspace: Workspace, names: list[str]) -> None:
+    """Warn before mapping if the verified pairs do not connect the photos that have any."""
+    from corrsfm.database import names_of_verified_pairs
+    from corrsfm.pairs import connected_components
+
+    parts = [
+        part
+        for part in connected_components(names, names_of_verified_pairs(workspace.database))
+        if len(part) > 1
+    ]
+    if len(parts) > 1:
+        logger.warning(
+            "verified pairs fall into %d components of %s photos: each becomes a model of its own at best; "
+            "add photos that bridge them, or try more features or more pairs\n"
+            "not connected to the largest: %s",
+            len(parts),
+            first_few(str(len(part)) for part in parts),
+            first_few(name for part in parts[1:] for name in part),
+        )
 
 
 def _content(path: Path) -> str:

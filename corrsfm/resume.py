@@ -22,7 +22,15 @@ from corrsfm.index import Index, read_index
 from corrsfm.store import ItemStore
 from corrsfm.workspace import StageRecord, Workspace
 
-__all__ = ["StageOutcome", "complete", "explain", "explain_photos", "finish", "refuse_vanished_photos"]
+__all__ = [
+    "StageOutcome",
+    "complete",
+    "explain",
+    "explain_photos",
+    "finish",
+    "refuse_vanished_photos",
+    "require_database",
+]
 
 logger = logging.getLogger("corrsfm")
 
@@ -175,6 +183,24 @@ def explain_photos(workspace: Workspace, index: Index) -> None:
         if names:
             shown = first_few(sorted(names))
             logger.info("photos %s since the last run: %d (%s)", text, len(names), shown)
+
+
+def require_database(workspace: Workspace) -> StageRecord:
+    """The record of the verified matches, whose database must be whole.
+
+    Raises
+    ------
+    WorkspaceError
+        Naming the command to run.
+    """
+    from corrsfm.colmap import is_truncated
+
+    record = workspace.require("verified matches")
+    path = workspace.database
+    if not path.is_file() or is_truncated(path):
+        what = "damaged, its end is missing" if path.is_file() else "missing"
+        raise WorkspaceError(f"{path}: {what}; run: {workspace.command_for('verified matches')}")
+    return record
 
 
 def refuse_vanished_photos(workspace: Workspace, images_dir: Path) -> None:

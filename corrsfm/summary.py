@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from corrsfm.files import atomic_write_json
 from corrsfm.index import read_index, read_pairs
 from corrsfm.machine import versions
+from corrsfm.resume import require_database
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches
 from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import STAGE_COMMANDS, Workspace
@@ -32,7 +33,7 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     from corrsfm.report import make_report
     from corrsfm.report.page import write_html
 
-    workspace.require("verified matches")
+    require_database(workspace)
     records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}
     if "models" in records and not workspace.current_record_of("models"):
         del records["models"]

@@ -279,15 +279,21 @@ class Workspace:
         except WorkspaceError:
             return None
 
-    def command_for(self, stage: str) -> str:
+    def command_for(self, stage: str, *, images_dir: str | None = None) -> str:
         """The command that makes a stage, with the options that it was made with, quoted for a shell.
 
         The seed is not recorded with a stage and so not repeated.
+
+        Parameters
+        ----------
+        stage : str
+        images_dir : str, optional
+            To take the place of the folder of photos that the workspace knows.
         """
         command = STAGE_COMMANDS[stage]
         words = ["corrsfm", command]
         if command == "extract":
-            words.append(self._values["images_dir"] or "IMAGES")
+            words.append(images_dir or self._values["images_dir"] or "IMAGES")
         words.append(str(self.root))
         for name, options in _OPTIONS_OF_COMMAND[command].items():
             if record := self.record_of(name):

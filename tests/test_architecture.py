@@ -62,6 +62,7 @@ SAME_LAYER: set[tuple[str, str]] = {
     ("store", "journal"),
     ("pipeline", "resume"),
     ("pipeline", "summary"),
+    ("summary", "resume"),
     ("run", "pipeline"),
     ("run", "resume"),
     ("evaluation", "pipeline"),

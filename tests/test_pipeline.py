@@ -505,3 +505,61 @@ def test_the_bar_of_mapping_starts_again_with_the_count(
     monkeypatch.setattr(reconstruction, "reconstruct", map_twice)
     pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
     assert shown[-6:] == [2, 3, 4, "again", 2, 3]
+
+
+def test_a_truncated_database_is_written_anew(
+    workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    verify(workspace, photos)
+    whole = workspace.database.read_bytes()
+    assert pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
+    workspace.database.write_bytes(whole[: len(whole) // 2])
+    for stage in (
+        lambda: pipeline.report(workspace),
+        lambda: pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN),
+    ):
+        with pytest.raises(WorkspaceError, match=r"damaged, its end is missing; run: corrsfm prune .* ratio"):
+            stage()
+    assert not pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
+    assert "database.db: damaged, its end is missing; it is written anew" in caplog.text
+    assert len(workspace.database.read_bytes()) == len(whole)
+    assert pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
+
+
+def colours(workspace: Workspace) -> set[tuple[int, ...]]:
+    (model,) = colmap.read_models(workspace.sparse)
+    return {tuple(point.color.tolist()) for point in model.points3D.values()}
+
+
+@pytest.mark.parametrize("mapper", list(cfg.Mapper))
+def test_photos_that_were_moved_cost_the_colours_only(
+    mapper: cfg.Mapper, workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    verify(workspace, photos)
+    elsewhere = photos.rename(photos.with_name("elsewhere"))
+    config = cfg.ReconstructionConfig(mapper=mapper, min_model_size=2)
+    assert not pipeline.reconstruct(workspace, config, RUN).skipped
+    extract = f"corrsfm extract NEWDIR {workspace.root} --max-features 60"
+    assert f"photos are no longer at {photos}; the points stay black; " in caplog.text
+    assert extract in caplog.text
+    assert colours(workspace) == {(0, 0, 0)}
+    assert pipeline.reconstruct(workspace, config, RUN).skipped
+    assert pipeline.report(workspace, html=True).models and workspace.report_html.exists()
+    verify(workspace, elsewhere)
+    assert not pipeline.reconstruct(workspace, config, RUN).skipped
+    assert len(colours(workspace)) > 3
+    elsewhere.rename(photos)
+    assert pipeline.reconstruct(workspace, config, RUN).skipped
+
+
+def test_verified_pairs_in_two_parts_are_told_before_mapping(
+    workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    for number in range(3):
+        write_photo(photos / f"other{number}.png", 40 * number, seed=1)
+    verify(workspace, photos)
+    pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
+    assert (
+        "verified pairs fall into 2 components of 4, 3 photos: each becomes a model of its own" in caplog.text
+    )
+    assert "not connected to the largest: other0.png, other1.png, other2.png" in caplog.text
