@@ -121,6 +121,7 @@ def option(
     above: float | None = None,
     maximum: float | None = None,
     affects_result: bool = True,
+    used_with: tuple[str, tuple[StrEnum, ...]] | None = None,
 ) -> Any:
     """A dataclass field with what the command line and the resume logic need to know about it.
 
@@ -139,6 +140,8 @@ def option(
         Largest valid value; for whole numbers `LARGEST_INT` if not given. Floats must be finite in any case.
     affects_result : bool
         False for options of speed and memory only: they do not make finished work stale.
+    used_with : tuple, optional
+        The name of another option of the class, and those of its choices with which this one has an effect.
     """
     return field(
         default=default,
@@ -149,6 +152,7 @@ def option(
             "above": above,
             "maximum": maximum,
             "affects_result": affects_result,
+            "used_with": used_with,
         },
     )
 
@@ -183,23 +187,40 @@ class FeaturesConfig:
     root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
 
 
+_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
+_SPATIAL = ("pairing", (PairStrategy.SPATIAL,))
+_FILE = ("pairing", (PairStrategy.FILE, PairStrategy.AUTO))
+_COVISIBILITY = ("pairing", (PairStrategy.COVISIBILITY, PairStrategy.AUTO))
+
+
 @dataclass(frozen=True, kw_only=True)
 class PairsConfig:
     """Which photos are matched with each other."""
 
     pairing: tuple[PairStrategy, ...] = option(
         (PairStrategy.AUTO,),
-        "Strategy; give it several times for their union. auto: exhaustive up to 200 photos, then retrieval",
+        "Strategy; give it several times for their union. auto: what --pairs-file or --covisible-model say "
+        "if given, else exhaustive up to 200 photos, then retrieval",
     )
-    sequential_overlap: int = option(10, "Neighbours on each side in natural name order", minimum=1)
-    sequential_quadratic: bool = option(False, "Also pair photos 2, 4, 8 … apart")
+    sequential_overlap: int = option(
+        10, "Neighbours on each side in natural name order", minimum=1, used_with=_SEQUENTIAL
+    )
+    sequential_quadratic: bool = option(False, "Also pair photos 2, 4, 8 … apart", used_with=_SEQUENTIAL)
     loop_closure: bool = option(False, "Add retrieval pairs to a sequence, to close loops")
     num_retrieved: int = option(30, "Most similar photos paired with each photo", minimum=1)
-    num_spatial: int = option(30, "Nearest photos by GPS paired with each photo", minimum=1)
-    max_distance_m: float = option(150.0, "Farthest GPS neighbour", unit="m", above=0)
-    pairs_file: Path | None = option(None, "Text file with 'name0 name1' per line, for the strategy file")
-    covisible_model: Path | None = option(None, "COLMAP model folder, for the strategy covisibility")
-    num_covisible: int = option(30, "Photos with most shared points paired with each photo", minimum=1)
+    num_spatial: int = option(
+        30, "Nearest photos by GPS paired with each photo", minimum=1, used_with=_SPATIAL
+    )
+    max_distance_m: float = option(150.0, "Farthest GPS neighbour", unit="m", above=0, used_with=_SPATIAL)
+    pairs_file: Path | None = option(
+        None, "Text file with 'name0 name1' per line, for the strategy file", used_with=_FILE
+    )
+    covisible_model: Path | None = option(
+        None, "COLMAP model folder, for the strategy covisibility", used_with=_COVISIBILITY
+    )
+    num_covisible: int = option(
+        30, "Photos with most shared points paired with each photo", minimum=1, used_with=_COVISIBILITY
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,6 +232,11 @@ class MatchesConfig:
     )
 
 
+_NETWORK = ("method", (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE))
+_ESTIMATOR = ("method", (PruneMethod.LORANSAC, PruneMethod.MAGSAC))
+_RATIO = ("method", (PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC, PruneMethod.CASCADE))
+
+
 @dataclass(frozen=True, kw_only=True)
 class PruneConfig:
     """Pruning of putative matches."""
@@ -220,21 +246,35 @@ class PruneConfig:
         PruneMethod.CORRADAPTOR,
         "How putative matches are pruned; all but corradaptor and cascade need no network",
     )
-    model: Path | None = option(None, "Network checkpoint; the bundled one if not given")
+    model: Path | None = option(None, "Network checkpoint; the bundled one if not given", used_with=_NETWORK)
     operating_point: OperatingPoint = option(
-        OperatingPoint.SFM, "sfm keeps what mapping can use; pose is strict, for two-view poses"
+        OperatingPoint.SFM,
+        "sfm keeps what mapping can use; pose is strict, for two-view poses",
+        used_with=_NETWORK,
     )
-    max_ratio: float = option(0.8, "Largest descriptor distance ratio of the ratio test", above=0)
-    max_error_px: float = option(4.0, "Inlier threshold of the robust estimators", unit="px", above=0)
-    max_candidates: int = option(2000, "Matches per pair that the network sees, best ratio first", minimum=16)
+    max_ratio: float = option(
+        0.8, "Largest descriptor distance ratio of the ratio test", above=0, used_with=_RATIO
+    )
+    max_error_px: float = option(
+        4.0, "Inlier threshold of the robust estimators", unit="px", above=0, used_with=_ESTIMATOR
+    )
+    max_candidates: int = option(
+        2000,
+        "Matches per pair that the network sees, best ratio first",
+        minimum=16,
+        used_with=_NETWORK,
+    )
     precision: Precision = option(
-        Precision.AUTO, "Number format of the network; auto is bfloat16 where it is faster"
+        Precision.AUTO,
+        "Number format of the network; auto is bfloat16 where it is faster",
+        used_with=_NETWORK,
     )
     max_batch_matches: int = option(
         16000,
         "Matches in one network batch, padding included; bounds memory",
         minimum=16,
         affects_result=False,
+        used_with=_NETWORK,
     )
 
 
@@ -414,6 +454,8 @@ def load_pipeline(path: Path) -> PipelineConfig:
     """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; expected a pipeline file in TOML") from error
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read ({error.strerror}); expected a pipeline file in TOML"

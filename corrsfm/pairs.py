@@ -63,8 +63,8 @@ def make_pairs(
     records : sequence of ImageRecord
         The photos of the scene.
     config : PairsConfig
-        ``auto`` means exhaustive up to 200 photos and retrieval above. With several strategies the result is
-        their union.
+        ``auto`` means the strategies file and covisibility if there is a pairs file or a model for them, else
+        exhaustive up to 200 photos and retrieval above. With several strategies the result is their union.
     load_features : callable, optional
         Name → features; needed by retrieval and loop closure only.
     seed : int
@@ -83,7 +83,7 @@ def make_pairs(
         If a pairs file or model does not fit the photos, or no photo has a GPS position.
     """
     names = sorted(record.name for record in records)
-    strategies = _resolve(config.pairing, len(names))
+    strategies = _resolve(config, len(names))
     retrieved: IndexPairs | None = None
     loop_closure = config.loop_closure and PairStrategy.SEQUENTIAL in strategies
     if config.loop_closure and not loop_closure:
@@ -116,10 +116,19 @@ def make_pairs(
     return _merged(names, proposals)
 
 
-def _resolve(strategies: Sequence[PairStrategy], num_photos: int) -> list[PairStrategy]:
+def _resolve(config: PairsConfig, num_photos: int) -> list[PairStrategy]:
     """The strategies without repetition, ``auto`` replaced by what it stands for."""
-    automatic = PairStrategy.EXHAUSTIVE if num_photos <= MAX_EXHAUSTIVE_PHOTOS else PairStrategy.RETRIEVAL
-    return sorted({automatic if strategy == PairStrategy.AUTO else strategy for strategy in strategies})
+    strategies = set(config.pairing)
+    if PairStrategy.AUTO in strategies:
+        strategies.remove(PairStrategy.AUTO)
+        if config.pairs_file is not None:
+            strategies.add(PairStrategy.FILE)
+        if config.covisible_model is not None:
+            strategies.add(PairStrategy.COVISIBILITY)
+        if config.pairs_file is None and config.covisible_model is None:
+            few = num_photos <= MAX_EXHAUSTIVE_PHOTOS
+            strategies.add(PairStrategy.EXHAUSTIVE if few else PairStrategy.RETRIEVAL)
+    return sorted(strategies)
 
 
 def _needed(path: Path | None, flag: str, strategy: PairStrategy) -> Path:

@@ -130,6 +130,15 @@ def test_auto_is_exhaustive_for_small_scenes_and_retrieval_for_large_ones() -> N
     assert len(large) <= 201 * 4
 
 
+def test_auto_takes_the_pairs_file_and_the_model_that_are_given(inputs: dict[str, Path]) -> None:
+    listed = make_pairs(video(12), PairsConfig(pairs_file=inputs["pairs_file"]))
+    assert listed == make_pairs(video(12), PairsConfig(pairing=(FILE,), pairs_file=inputs["pairs_file"]))
+    both = make_pairs(video(12), PairsConfig(**inputs))
+    assert {name for origin in both.origins for name in origin} == {"file", "covisibility"}
+    union = make_pairs(video(12), PairsConfig(pairing=(EXHAUSTIVE,), **inputs))
+    assert set(union.origins) == {("exhaustive",)}
+
+
 def test_loop_closure_adds_retrieval_pairs_to_a_sequence_only(caplog: pytest.LogCaptureFixture) -> None:
     config = PairsConfig(pairing=(SEQUENTIAL,), sequential_overlap=1, loop_closure=True, num_retrieved=2)
     # The made-up descriptors repeat after 25 frames.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import click
@@ -31,7 +32,7 @@ PATH = click.Path(path_type=Path)
 )
 @click.option("--ground-truth", type=PATH, help="COLMAP model or folder of camera files to measure against.")
 @click.option("--results", type=PATH, help="Also write the result file here.")
-@pipeline_options
+@functools.partial(pipeline_options, several_methods=True)
 @overwrite_option
 @json_option
 def compare(

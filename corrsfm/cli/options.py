@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import logging
 import typing
 from collections.abc import Callable, Collection, Sequence
 from enum import StrEnum
@@ -30,12 +31,18 @@ __all__ = [
 # Where an invocation notes that finished work is to be redone.
 OVERWRITE_KEY = "corrsfm.overwrite"
 
+logger = logging.getLogger("corrsfm")
+
 F = typing.TypeVar("F", bound=Callable[..., Any])
+
+
+def _flag(entry: dataclasses.Field) -> str:
+    return "--" + entry.name.replace("_", "-")
 
 
 def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
     """One click option for one config field."""
-    flag = "--" + entry.name.replace("_", "-")
+    flag = _flag(entry)
     inner = next(
         (a for a in typing.get_args(annotation) if a is not type(None) and a is not Ellipsis), annotation
     )
@@ -85,11 +92,12 @@ def config_options(**configs: type) -> Callable[[F], F]:
     return decorate
 
 
-def pipeline_options(command: F) -> F:
+def pipeline_options(command: F, *, several_methods: bool = False) -> F:
     """``--pipeline FILE`` and a flag for every option of every stage.
 
     The command is called with ``config=PipelineConfig(...)``: the file's values, overridden by the flags that
-    the user really typed.
+    the user really typed. One with ``several_methods`` prunes by others than the config's, so that no option
+    of pruning is idle.
     """
     file_option = click.option(
         "--pipeline",
@@ -98,7 +106,8 @@ def pipeline_options(command: F) -> F:
         help="Pipeline file in TOML; flags typed here override it.",
     )
     tables = [entry.name for entry in dataclasses.fields(cfg.PipelineConfig)]
-    return file_option(_overriding(command, "config", cfg.PipelineConfig(), cfg.load_pipeline, tables))
+    used = ["prune"] if several_methods else []
+    return file_option(_overriding(command, "config", cfg.PipelineConfig(), cfg.load_pipeline, tables, used))
 
 
 def recipe_options(command: F) -> F:
@@ -119,14 +128,24 @@ def recipe_options(command: F) -> F:
 
 
 def _overriding(
-    command: F, keyword: str, default: Any, load: Callable[[Path], Any], tables: Sequence[str]
+    command: F,
+    keyword: str,
+    default: Any,
+    load: Callable[[Path], Any],
+    tables: Sequence[str],
+    used: Collection[str] = (),
 ) -> F:
-    """A command called with the config in its option ``file``, and flags that override some tables of it."""
+    """A command called with the config in its option ``file``, and flags that override some tables of it.
+
+    Of tables in ``used`` no flag is idle, whatever the others say.
+    """
 
     @functools.wraps(command)
     def wrapped(*args: Any, file: Path | None, **kwargs: Any) -> Any:
         base = load(file) if file else default
-        changed = {name: _override(getattr(base, name), kwargs) for name in tables}
+        changed = {
+            name: _override(getattr(base, name), kwargs, may_be_idle=name not in used) for name in tables
+        }
         return command(*args, **{keyword: dataclasses.replace(base, **changed)}, **kwargs)
 
     return typing.cast(F, _with_flags(wrapped, [type(getattr(default, name)) for name in tables]))
@@ -141,8 +160,11 @@ def _with_flags(command: Callable, configs: Collection[type]) -> Callable:
     return command
 
 
-def _override(base: Any, values: dict[str, Any]) -> Any:
-    """A config with the flags that the user typed, which are taken out of ``values``, all checked."""
+def _override(base: Any, values: dict[str, Any], *, may_be_idle: bool = True) -> Any:
+    """A config with the flags that the user typed, which are taken out of ``values``, all checked.
+
+    A warning names those without effect beside the others.
+    """
     context = click.get_current_context()
     given = {}
     for entry in dataclasses.fields(base):
@@ -150,7 +172,25 @@ def _override(base: Any, values: dict[str, Any]) -> Any:
         if context.get_parameter_source(entry.name) is not ParameterSource.DEFAULT:
             given[entry.name] = value
     checked = cfg.from_dict(type(base), given, "command line")
-    return dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
+    config = dataclasses.replace(base, **{name: getattr(checked, name) for name in given})
+    if may_be_idle:
+        _warn_of_idle(config, given)
+    return config
+
+
+def _warn_of_idle(config: Any, given: Collection[str]) -> None:
+    """Say which of the given options have no effect with what another option chooses."""
+    idle: dict[str, list[str]] = {}
+    for entry in dataclasses.fields(config):
+        if entry.name not in given or entry.metadata["used_with"] is None:
+            continue
+        chooser, choices = entry.metadata["used_with"]
+        chosen = getattr(config, chooser)
+        chosen = chosen if isinstance(chosen, tuple) else (chosen,)
+        if not set(chosen) & set(choices):
+            idle.setdefault(f"--{chooser} {'+'.join(chosen)}", []).append(_flag(entry))
+    for choice, flags in idle.items():
+        logger.warning("%s: no effect with %s", ", ".join(flags), choice)
 
 
 def run_options(command: F) -> F:
