@@ -66,6 +66,8 @@ def prepare(
 @click.option("--threads", default=0, show_default=True, help="Threads to use; 0 for all cores.")
 def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
     """Train by a recipe, alone or on several GPUs under torchrun."""
+    if not recipe.train.train_files:
+        raise click.UsageError("no pairs to train on; give --train-files, or --config with train_files")
     from corrsfm.machine import count_threads, find_device, use_threads
     from corrsfm.training.loop import train as train_by_recipe
 

@@ -141,6 +141,8 @@ def load_recipe(path: Path) -> TrainRecipe:
     """
     try:
         values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path}: no such file; expected a training recipe in TOML") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: cannot be read as a training recipe in TOML ({error})") from error
     network = values.pop("network", {})
