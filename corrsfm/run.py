@@ -47,7 +47,7 @@ def run_scene(
     """
     run = config.run
     pipeline.check_options(run, config.prune)
-    workspace = Workspace(workspace_dir, create=True)
+    workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
     with workspace.lock():
         _say(pipeline.index_photos(workspace, images_dir, config.images, run, overwrite=overwrite))
         _say(pipeline.extract_features(workspace, config.features, run, overwrite=overwrite))

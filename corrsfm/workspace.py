@@ -116,14 +116,22 @@ class Workspace:
     root : Path
     create : bool
         Make the folder if it does not exist; otherwise that is an error.
+    images_dir : Path, optional
+        Folder of the photos that it is for.
 
     Raises
     ------
     WorkspaceError
-        If the folder is not a workspace, or one of another version, or its manifest is damaged.
+        If the folder is not a workspace, or one of another version, or its manifest is damaged, or it is the
+        folder of the photos.
     """
 
-    def __init__(self, root: Path, *, create: bool = False) -> None:
+    def __init__(self, root: Path, *, create: bool = False, images_dir: Path | None = None) -> None:
+        if images_dir is not None and root.resolve() == images_dir.resolve():
+            raise WorkspaceError(
+                f"{root}: is the folder of the photos; choose another for the workspace, such as"
+                f" {root / 'corrsfm'}"
+            )
         self.root = root
         self.manifest = root / "workspace.json"
         self.images_txt = root / "images.txt"
@@ -302,6 +310,8 @@ class Workspace:
 
     def finish(self, stage: str, record: StageRecord) -> None:
         """Record a stage as finished now."""
+        if stage == "models":
+            self._values.pop("mapping_failed", None)
         stamped = {**record.__dict__, "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
         self._values["stages"][stage] = stamped
         atomic_write_json(self.manifest, self._values)
@@ -311,12 +321,22 @@ class Workspace:
         if self._values["stages"].pop(stage, None) is not None:
             atomic_write_json(self.manifest, self._values)
 
-    def put_models_aside(self) -> None:
-        """Move the models, and the reports about them, to ``sparse.old``, so that nobody takes them for new.
+    @property
+    def mapping_failed(self) -> bool:
+        """Whether mapping was tried on the verified matches that there are now and no model came out."""
+        verified = self.record_of("verified matches")
+        return verified is not None and self._values.get("mapping_failed") == verified.fingerprint
 
-        What was put aside before is replaced.
+    def put_models_aside(self) -> None:
+        """Remember that mapping failed, and move the models of earlier matches out of the way.
+
+        They go to ``sparse.old``, with the reports about them, so that nobody takes them for new. What was
+        put aside before is replaced.
         """
         self.forget("models")
+        if verified := self.record_of("verified matches"):
+            self._values["mapping_failed"] = verified.fingerprint
+            atomic_write_json(self.manifest, self._values)
         if not self.sparse.is_dir():
             self.run_json.unlink(missing_ok=True)
             return

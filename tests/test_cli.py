@@ -110,6 +110,8 @@ def test_mapping_nothing_ends_with_the_reason_and_a_code(scene: Path) -> None:
     [
         (["extract", "{empty}", "{new}"], "empty"),
         (["extract", "{missing}", "{new}"], "missing"),
+        (["extract", "{photos}", "{photos}/"], "is the folder of the photos; choose another"),
+        (["run", "{photos}", "{photos}/../photos"], "is the folder of the photos; choose another"),
         (["prune", "{empty}"], "not a corrsfm workspace"),
         (["match", "{missing}"], "not a corrsfm workspace"),
         (["reconstruct", "{scene}"], "no verified matches yet; run: corrsfm prune"),

@@ -214,3 +214,11 @@ def test_models_put_aside_take_their_reports_along(workspace: Workspace) -> None
     workspace.put_models_aside()
     assert sorted(path.name for path in aside.iterdir()) == ["0", "run.json"]
     assert (aside / "run.json").read_text() == "second"
+
+
+def test_the_folder_of_the_photos_is_no_workspace_and_stays_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="is the folder of the photos; choose another"):
+        Workspace(tmp_path, create=True, images_dir=tmp_path / "." / "sub" / "..")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "images").mkdir()
+    assert Workspace(tmp_path, create=True, images_dir=tmp_path / "images").root == tmp_path

@@ -76,7 +76,7 @@ def extract(
     from corrsfm.workspace import Workspace
 
     pipeline.check_options(run)
-    workspace = Workspace(workspace_dir, create=True)
+    workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
     with workspace.lock():
         outcomes = [
             pipeline.index_photos(workspace, images_dir, images, run, overwrite=overwrite),
