@@ -14,6 +14,7 @@ LAYERS: dict[str, int] = {
     "corrsfm": 0,
     "errors": 0,
     "types": 0,
+    "options": 0,
     "config": 0,
     "geometry": 0,
     "files": 0,
@@ -53,7 +54,9 @@ STAGES = {name for name, layer in LAYERS.items() if layer == 2}
 SAME_LAYER: set[tuple[str, str]] = {
     ("geometry", "types"),
     ("types", "errors"),
+    ("options", "errors"),
     ("config", "errors"),
+    ("config", "options"),
     ("files", "errors"),
     ("images", "cameras"),
     ("index", "cameras"),
