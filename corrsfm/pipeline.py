@@ -28,6 +28,8 @@ from corrsfm.resume import (
     explain,
     explain_photos,
     finish,
+    mark_left_out,
+    photos_left_out,
     refuse_vanished_photos,
     require_database,
 )
@@ -145,8 +147,7 @@ def extract_features(
         record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
         for record in index.records
     }
-    # Of their own, so that these photos are tried again when there is another chance.
-    of_left_out = {name: config_hash("left out", fingerprint) for name, fingerprint in wanted.items()}
+    of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
     store = ItemStore(workspace.features, FEATURES)
     records = {record.name: record for record in index.records}
     extract = create_extractor(config)
@@ -201,7 +202,10 @@ def extract_features(
 def make_pairs(
     workspace: Workspace, config: cfg.PairsConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
-    """Choose the pairs to match, and warn if they do not connect all photos."""
+    """Choose the pairs to match, and warn if they do not connect all photos.
+
+    Photos that were left out as unreadable have no pairs.
+    """
     from corrsfm import pairs as pairing
 
     started = time.monotonic()
@@ -211,18 +215,30 @@ def make_pairs(
     fingerprint = config_hash(
         "pairs", config, run.seed, [[r.name, r.gps] for r in index.records], features.fingerprint, *files
     )
+    left_out = photos_left_out(workspace, index.names)
+    records = [record for record in index.records if record.name not in left_out]
+    if len(records) < 2:
+        raise InputError(
+            f"{workspace.root}: {len(left_out)} of {len(index.records)} photos cannot be read, at least 2 "
+            "are needed; replace them and run again"
+        )
+    names = [record.name for record in records]
     if not overwrite and workspace.is_current("pairs", fingerprint, workspace.pairs, workspace.pair_origins):
         pair_list = read_pairs(workspace)
-        _warn_if_disconnected(index, pair_list)
+        _warn_if_disconnected(names, pair_list)
         return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
     explain(workspace, "pairs", config)
     with ItemStore(workspace.features, FEATURES).reader() as read:
-        pair_list = pairing.make_pairs(index.records, config, load_features=read, seed=run.seed)
+        # A list or a model may well name photos that were left out; that is no mistake.
+        candidates = index.records if files else records
+        pair_list = _without(
+            left_out, pairing.make_pairs(candidates, config, load_features=read, seed=run.seed)
+        )
     if not len(pair_list):
         raise InputError(
             f"{workspace.root}: no pair of photos to match; choose another --pairing or larger neighbourhoods"
         )
-    _warn_if_disconnected(index, pair_list)
+    _warn_if_disconnected(names, pair_list)
     workspace.forget("pairs")
     write_pairs(workspace, pair_list)
     outcome = StageOutcome(stage="pairs", num_items=len(pair_list), seconds=time.monotonic() - started)
@@ -426,10 +442,19 @@ def reconstruct(
     return outcome
 
 
-def _warn_if_disconnected(index: Index, pair_list: PairList) -> None:
+def _without(names: set[str], pair_list: PairList) -> PairList:
+    """The pairs of a list that are of other photos than these."""
+    kept = [number for number, pair in enumerate(pair_list.pairs) if names.isdisjoint(pair)]
+    return PairList(
+        pairs=tuple(pair_list.pairs[number] for number in kept),
+        origins=tuple(pair_list.origins[number] for number in kept),
+    )
+
+
+def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
     from corrsfm.pairs import describe_components
 
-    text = describe_components(index.names, pair_list.pairs)
+    text = describe_components(names, pair_list.pairs)
     if text:
         logger.warning("%s", text)
 

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from corrsfm import config as cfg
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.index import Index, read_index
-from corrsfm.store import ItemStore
+from corrsfm.store import FEATURES, ItemStore
 from corrsfm.workspace import StageRecord, Workspace
 
 __all__ = [
@@ -28,11 +28,15 @@ __all__ = [
     "explain",
     "explain_photos",
     "finish",
+    "mark_left_out",
+    "photos_left_out",
     "refuse_vanished_photos",
     "require_database",
 ]
 
 logger = logging.getLogger("corrsfm")
+
+_LEFT_OUT = "left out"
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -183,6 +187,26 @@ def explain_photos(workspace: Workspace, index: Index) -> None:
         if names:
             shown = first_few(sorted(names))
             logger.info("photos %s since the last run: %d (%s)", text, len(names), shown)
+
+
+def mark_left_out(fingerprint: str) -> str:
+    """Fingerprint for a photo that was left out, in place of that of its features.
+
+    It is another one so that the photo is tried again when there is another chance.
+    """
+    return f"{_LEFT_OUT} {fingerprint}"
+
+
+def photos_left_out(workspace: Workspace, names: Iterable[str]) -> set[str]:
+    """Photos of the index that could not be read and so have no features.
+
+    Raises
+    ------
+    WorkspaceError
+        If the features cannot be read.
+    """
+    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(names)
+    return {name for name, fingerprint in fingerprints.items() if fingerprint.startswith(_LEFT_OUT)}
 
 
 def require_database(workspace: Workspace) -> StageRecord:

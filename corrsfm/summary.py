@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from corrsfm.files import atomic_write_json
 from corrsfm.index import read_index, read_pairs
 from corrsfm.machine import versions
-from corrsfm.resume import require_database
+from corrsfm.resume import photos_left_out, require_database
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches
 from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import STAGE_COMMANDS, Workspace
@@ -39,9 +39,12 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
         del records["models"]
         logger.warning("models are older than the matches; run: %s", workspace.command_for("models"))
     models = read_models(workspace.sparse) if "models" in records else []
+    names = read_index(workspace).names
     summary = make_report(
         scene=workspace.root.resolve().name,
-        image_names=read_index(workspace).names,
+        image_names=names,
+        left_out=photos_left_out(workspace, names),
+        mapped="models" in records or workspace.mapping_failed,
         pairs=_pair_statistics(workspace),
         models=[summarise_model(model) for model in models],
         stage_seconds={stage: record.seconds for stage, record in records.items()},

@@ -333,11 +333,29 @@ def test_a_broken_link_is_an_unreadable_photo(workspace: Workspace, photos: Path
     assert outcome.num_items == 4
 
 
-def test_a_truncated_photo_is_left_out_on_request(workspace: Workspace, photos: Path) -> None:
+def test_a_truncated_photo_is_left_out_on_request(
+    workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     whole = (photos / "2.png").read_bytes()
     (photos / "2.png").write_bytes(whole[: len(whole) // 2])
     pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
     assert pipeline.extract_features(workspace, SMALL, RUN).num_items == len(read_index(workspace).names)
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+    assert read_pairs(workspace).pairs == (("0.png", "1.png"), ("0.png", "3.png"), ("1.png", "3.png"))
+    assert "do not connect" not in caplog.text
+    (photos.parent / "pairs.txt").write_text("0.png 1.png\n1.png 2.png\n2.png 3.png\n")
+    listed = cfg.PairsConfig(pairing=(cfg.PairStrategy.FILE,), pairs_file=photos.parent / "pairs.txt")
+    pipeline.make_pairs(workspace, listed, RUN)
+    assert read_pairs(workspace).pairs == (("0.png", "1.png"),)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN)
+    pipeline.prune_matches(workspace, cfg.PruneConfig(method=cfg.PruneMethod.RATIO), RUN)
+    pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN)
+    assert {image.name: str(image.reason) for image in pipeline.report(workspace).missing} == {
+        "0.png": "not mapped yet",
+        "1.png": "not mapped yet",
+        "2.png": "unreadable, left out",
+        "3.png": "no pair",
+    }
 
 
 def test_a_left_out_photo_is_tried_again(
@@ -478,6 +496,7 @@ def test_a_failed_mapping_leaves_no_stale_model_to_take_for_new(tmp_path: Path, 
     assert workspace.report_html.exists()
     assert not workspace.sparse.exists() and not workspace.run_json.exists()
     assert (workspace.root / "sparse.old" / "run.json").read_text() == "of earlier matches"
+    assert "mapper could not place it" not in workspace.report_json.read_text()
     assert '"models": []' in workspace.report_json.read_text()
     assert Workspace(workspace.root).record_of("models") is None
 

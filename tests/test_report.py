@@ -69,8 +69,16 @@ def report() -> SceneReport:
         ("e.jpg", MissingReason.NO_MATCH, "no match in 1 pair; it may have no keypoints"),
         ("f.jpg", MissingReason.PRUNED, "no match kept in 2 pairs; most putative ones: 120 with a.jpg"),
         ("g.jpg", MissingReason.NOT_VERIFIED, "none of 1 pair verified; most kept: 9 with a.jpg"),
-        ("h.jpg", MissingReason.OTHER_MODEL, "one of 2 photos of model 1"),
-        ("i.jpg", MissingReason.OTHER_MODEL, "one of 2 photos of model 1"),
+        (
+            "h.jpg",
+            MissingReason.OTHER_MODEL,
+            "one of 2 photos of model 1; no verified pairs connect them with model 0",
+        ),
+        (
+            "i.jpg",
+            MissingReason.OTHER_MODEL,
+            "one of 2 photos of model 1; no verified pairs connect them with model 0",
+        ),
         ("j.jpg", MissingReason.OTHER_COMPONENT, "verified pairs connect it with 1 other photo only"),
         ("k.jpg", MissingReason.OTHER_COMPONENT, "verified pairs connect it with 1 other photo only"),
         ("l.jpg", MissingReason.NOT_PLACED, "1 verified pair; most matches: 16 with a.jpg"),
@@ -85,7 +93,34 @@ def test_each_missing_photo_has_its_reason(name: str, reason: MissingReason, det
 def test_every_photo_is_either_registered_or_missing_with_each_reason_shown() -> None:
     names = [image.name for image in report().missing]
     assert names == NAMES[3:]
-    assert {image.reason for image in report().missing} == set(MissingReason)
+    others = {MissingReason.LEFT_OUT, MissingReason.NOT_MAPPED}
+    assert {image.reason for image in report().missing} == set(MissingReason) - others
+
+
+def test_a_photo_that_was_left_out_is_not_said_to_lack_keypoints() -> None:
+    made = make_report(scene="", image_names="ab", pairs=[pair("a", "b", 0, 0, 0)], models=[], left_out={"b"})
+    reasons = {image.name: (image.reason, image.detail) for image in made.missing}
+    assert reasons["a"][0] is MissingReason.NO_MATCH
+    assert reasons["b"] == ("unreadable, left out", "replace the file and run again")
+
+
+def test_the_mapper_is_not_blamed_before_it_ran() -> None:
+    pairs = [pair("a", "b", 50, 20, 18), pair("a", "c", 50, 0, 0), pair("x", "y", 50, 20, 16)]
+    made = make_report(scene="", image_names="abcxy", pairs=pairs, models=[], mapped=False)
+    assert {image.name: image.reason for image in made.missing} == {
+        **dict.fromkeys("abxy", MissingReason.NOT_MAPPED),
+        "c": MissingReason.PRUNED,
+    }
+    assert made.missing[0].detail == "1 verified pair; most matches: 18 with b"
+
+
+def test_a_model_of_photos_that_pairs_connect_with_the_first_is_told_from_one_of_others() -> None:
+    pairs = [pair("a", "b", 99, 99, 99), pair("b", "c", 99, 99, 99), pair("c", "d", 99, 99, 99)]
+    models = [model("a", "b"), model("c", "d")]
+    made = make_report(scene="", image_names="abcd", pairs=pairs, models=models)
+    assert {image.detail for image in made.missing} == {
+        "one of 2 photos of model 1; verified pairs connect them with model 0"
+    }
 
 
 def test_counts_are_exact() -> None:
@@ -138,6 +173,7 @@ def test_json_begins_with_a_summary() -> None:
     values = report().to_dict()
     assert list(values)[:2] == ["format_version", "summary"]
     assert values["summary"]["model_sizes"] == [3, 2]
+    assert (values["summary"]["num_registered"], values["summary"]["num_in_models"]) == (3, 5)
     assert values["summary"]["num_points"] == 200
     assert values["summary"]["seconds"] == 3.75
 
@@ -151,7 +187,7 @@ def test_table_is_aligned_and_complete() -> None:
     assert format_table(report()) == "\n".join(
         [
             "scene               desk",
-            "photos              3 of 13 registered (23.1 %)",
+            "photos              3 of 13 registered (23.1 %), 5 in all models",
             "models              2, with 3, 2 photos",
             "points              200",
             "observations        700, 233.3 a photo",
@@ -168,10 +204,12 @@ def test_table_is_aligned_and_complete() -> None:
             "  f.jpg  pruned to nothing          "
             "no match kept in 2 pairs; most putative ones: 120 with a.jpg",
             "  g.jpg  too few verified matches   none of 1 pair verified; most kept: 9 with a.jpg",
-            "  h.jpg  in another model           one of 2 photos of model 1",
-            "  i.jpg  in another model           one of 2 photos of model 1",
-            "  j.jpg  other component            verified pairs connect it with 1 other photo only",
-            "  k.jpg  other component            verified pairs connect it with 1 other photo only",
+            "  h.jpg  in another model           "
+            "one of 2 photos of model 1; no verified pairs connect them with model 0",
+            "  i.jpg  in another model           "
+            "one of 2 photos of model 1; no verified pairs connect them with model 0",
+            "  j.jpg  in another component       verified pairs connect it with 1 other photo only",
+            "  k.jpg  in another component       verified pairs connect it with 1 other photo only",
             "  l.jpg  mapper could not place it  1 verified pair; most matches: 16 with a.jpg",
             "  m.jpg  mapper could not place it  2 verified pairs; most matches: 25 with b.jpg",
         ]

@@ -11,6 +11,7 @@ from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.errors import WorkspaceError
 from corrsfm.evaluation.scene import find_model
+from corrsfm.report import MissingReason
 from corrsfm.workspace import StageRecord, Workspace
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
@@ -57,6 +58,7 @@ def test_models_of_earlier_matches_are_not_mixed_with_new_ones(
     prune(workspace, 0.3)
     summary = pipeline.report(workspace)
     assert summary.models == ()
+    assert {image.reason for image in summary.missing} == {MissingReason.NOT_MAPPED}
     assert "models" not in summary.stage_seconds and "models" not in summary.configuration
     command = f"run: corrsfm reconstruct {workspace.root} --min-model-size 2"
     assert f"models are older than the matches; {command}" in caplog.text

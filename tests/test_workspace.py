@@ -222,3 +222,15 @@ def test_the_folder_of_the_photos_is_no_workspace_and_stays_as_it_is(tmp_path: P
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "images").mkdir()
     assert Workspace(tmp_path, create=True, images_dir=tmp_path / "images").root == tmp_path
+
+
+def test_a_failed_mapping_is_remembered_until_the_matches_change_or_it_succeeds(workspace: Workspace) -> None:
+    workspace.finish("verified matches", StageRecord(fingerprint="first"))
+    assert not workspace.mapping_failed
+    workspace.put_models_aside()
+    assert workspace.mapping_failed and Workspace(workspace.root).mapping_failed
+    workspace.finish("verified matches", StageRecord(fingerprint="second"))
+    assert not workspace.mapping_failed
+    workspace.put_models_aside()
+    workspace.finish("models", StageRecord(fingerprint="f"))
+    assert not workspace.mapping_failed

@@ -102,9 +102,10 @@ def _section(title: str, body: str) -> str:
 
 
 def _tiles(report: SceneReport) -> str:
-    """The four numbers that are looked for first."""
+    """The numbers that are looked for first."""
     tiles = [
         ("photos registered", f"{report.num_registered} / {len(report.image_names)}"),
+        *([("photos in all models", f"{report.num_in_models}")] if len(report.models) > 1 else []),
         ("pairs verified", f"{report.num_verified_pairs:,} / {len(report.pairs):,}"),
     ]
     if report.models:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -19,12 +19,14 @@ FORMAT_VERSION = 1
 class MissingReason(StrEnum):
     """Why a photo is not in the first model: the first step of the pipeline that lost it."""
 
+    LEFT_OUT = "unreadable, left out"
     NO_PAIR = "no pair"
     NO_MATCH = "no putative match"
     PRUNED = "pruned to nothing"
     NOT_VERIFIED = "too few verified matches"
     OTHER_MODEL = "in another model"
-    OTHER_COMPONENT = "other component"
+    NOT_MAPPED = "not mapped yet"
+    OTHER_COMPONENT = "in another component"
     NOT_PLACED = "mapper could not place it"
 
 
@@ -93,6 +95,11 @@ class SceneReport:
         return 100.0 * self.num_registered / max(len(self.image_names), 1)
 
     @property
+    def num_in_models(self) -> int:
+        """Photos in any of the models."""
+        return len({name for model in self.models for name in model.image_names})
+
+    @property
     def num_verified_pairs(self) -> int:
         """Pairs with a verified two-view geometry."""
         return sum(pair.num_verified > 0 for pair in self.pairs)
@@ -121,6 +128,7 @@ class SceneReport:
                 "num_images": len(self.image_names),
                 "num_registered": self.num_registered,
                 "registered_percent": self.registered_percent,
+                "num_in_models": self.num_in_models,
                 "num_models": len(self.models),
                 "model_sizes": [model.num_images for model in self.models],
                 "num_points": largest.num_points if largest else 0,
@@ -180,6 +188,8 @@ def make_report(
     image_names: Iterable[str],
     pairs: Iterable[PairStatistics],
     models: Sequence[ModelSummary],
+    left_out: Collection[str] = (),
+    mapped: bool = True,
     stage_seconds: Mapping[str, float] | None = None,
     configuration: Mapping[str, Any] | None = None,
     versions: Mapping[str, str] | None = None,
@@ -196,6 +206,10 @@ def make_report(
         All pairs that were matched, those pruned to nothing included.
     models : sequence of ModelSummary
         The largest first; none if mapping failed.
+    left_out : collection of str, optional
+        Photos that could not be read.
+    mapped : bool
+        False if the pairs have not been mapped yet, so that there are no models for that reason alone.
     stage_seconds, configuration, versions : mapping, optional
         See `SceneReport`.
 
@@ -212,7 +226,7 @@ def make_report(
         models=tuple(models),
         pairs=pairs,
         components=components,
-        missing=_missing_images(names, pairs, components, models),
+        missing=_missing_images(names, pairs, components, models, left_out, mapped),
         stage_seconds=dict(stage_seconds or {}),
         configuration=dict(configuration or {}),
         versions=dict(versions or {}),
@@ -243,6 +257,8 @@ def _missing_images(
     pairs: Sequence[PairStatistics],
     components: Sequence[tuple[str, ...]],
     models: Sequence[ModelSummary],
+    left_out: Collection[str],
+    mapped: bool,
 ) -> tuple[MissingImage, ...]:
     pairs_of: dict[str, list[PairStatistics]] = {name: [] for name in names}
     for pair in pairs:
@@ -257,12 +273,21 @@ def _missing_images(
     for name in names:
         if model_of.get(name) == 0:
             continue
-        if name in model_of:
+        component = component_of.get(name, ())
+        if name in left_out:
+            reason = MissingReason.LEFT_OUT
+            detail = "replace the file and run again"
+        elif name in model_of:
             reason = MissingReason.OTHER_MODEL
             size = models[model_of[name]].num_images
-            detail = f"one of {size} photos of model {model_of[name]}"
+            connected = (
+                "verified pairs connect them" if component == main else "no verified pairs connect them"
+            )
+            detail = f"one of {size} photos of model {model_of[name]}; {connected} with model 0"
+        elif component and not mapped:
+            reason, detail = MissingReason.NOT_MAPPED, _verified_pairs(name, pairs_of[name])
         else:
-            reason, detail = _lost_at(name, pairs_of[name], component_of.get(name, ()), main)
+            reason, detail = _lost_at(name, pairs_of[name], component, main)
         missing.append(MissingImage(name=name, reason=reason, detail=detail))
     return tuple(missing)
 
@@ -279,33 +304,42 @@ def _lost_at(
     name: str, pairs: Sequence[PairStatistics], component: tuple[str, ...], main: tuple[str, ...]
 ) -> tuple[MissingReason, str]:
     """The first step after which nothing of a photo's pairs was left, and the numbers behind it."""
-
-    def best(count: str) -> str:
-        pair = max(pairs, key=lambda pair: getattr(pair, count))
-        other = pair.name1 if pair.name0 == name else pair.name0
-        return f"{getattr(pair, count)} with {other}"
-
     if not pairs:
         return MissingReason.NO_PAIR, "it was not matched with any photo"
     among = f"{len(pairs)} pair" + ("s" if len(pairs) > 1 else "")
     if not any(pair.num_putative for pair in pairs):
         return MissingReason.NO_MATCH, f"no match in {among}; it may have no keypoints"
     if not any(pair.num_pruned for pair in pairs):
-        return MissingReason.PRUNED, f"no match kept in {among}; most putative ones: {best('num_putative')}"
+        return (
+            MissingReason.PRUNED,
+            f"no match kept in {among}; most putative ones: {_best(name, pairs, 'num_putative')}",
+        )
     if not component:
-        return MissingReason.NOT_VERIFIED, f"none of {among} verified; most kept: {best('num_pruned')}"
+        return (
+            MissingReason.NOT_VERIFIED,
+            f"none of {among} verified; most kept: {_best(name, pairs, 'num_pruned')}",
+        )
     if component != main:
         others = len(component) - 1
         return (
             MissingReason.OTHER_COMPONENT,
             f"verified pairs connect it with {others} other photo{'s' if others > 1 else ''} only",
         )
+    return MissingReason.NOT_PLACED, _verified_pairs(name, pairs)
+
+
+def _verified_pairs(name: str, pairs: Sequence[PairStatistics]) -> str:
+    """How many of a photo's pairs are verified, and the best of them."""
     num_verified = sum(pair.num_verified > 0 for pair in pairs)
     plural = "s" if num_verified > 1 else ""
-    return (
-        MissingReason.NOT_PLACED,
-        f"{num_verified} verified pair{plural}; most matches: {best('num_verified')}",
-    )
+    return f"{num_verified} verified pair{plural}; most matches: {_best(name, pairs, 'num_verified')}"
+
+
+def _best(name: str, pairs: Sequence[PairStatistics], count: str) -> str:
+    """The largest of some count of a photo's pairs, and with which photo."""
+    pair = max(pairs, key=lambda pair: getattr(pair, count))
+    other = pair.name1 if pair.name0 == name else pair.name0
+    return f"{getattr(pair, count)} with {other}"
 
 
 def _plain(value: Any) -> Any:

@@ -44,7 +44,7 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
         (
             "photos",
             f"{report.num_registered:,} of {len(report.image_names):,} registered "
-            f"({report.registered_percent:.1f} %)",
+            f"({report.registered_percent:.1f} %){_in_models(report)}",
         ),
         ("models", _models(report)),
     ]
@@ -79,6 +79,11 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
         stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.stage_seconds.items())
         rows.append(("seconds", f"{sum(report.stage_seconds.values()):.1f}: {stages}"))
     return rows
+
+
+def _in_models(report: SceneReport) -> str:
+    """What the largest model alone does not tell."""
+    return f", {report.num_in_models:,} in all models" if len(report.models) > 1 else ""
 
 
 def _models(report: SceneReport) -> str:
