@@ -17,12 +17,12 @@ from corrsfm.files import sha256_of
 from corrsfm.images import (
     duplicate_images,
     index_images,
-    list_images,
     name_remarks,
     read_image,
     read_mask,
     read_photo_info,
 )
+from corrsfm.listing import list_images
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (48, 64), depth: type = np.uint8) -> NDArray:

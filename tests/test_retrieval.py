@@ -111,7 +111,8 @@ def test_blocked_search_equals_a_plain_one(block_size: int, num_neighbours: int)
 @pytest.mark.slow
 def test_retrieval_finds_covisible_photos_of_real_scenes(shared_dir) -> None:  # type: ignore[no-untyped-def]
     from corrsfm.features import extract_features
-    from corrsfm.images import list_images, read_image
+    from corrsfm.images import read_image
+    from corrsfm.listing import list_images
 
     photos, covisible = {}, set()
     for name in ("parking_3", "copr", "puma"):
