@@ -14,14 +14,14 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
-from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError, first_few
+from corrsfm.errors import ImageError, InputError, WorkspaceError
 from corrsfm.files import sha256_of
 from corrsfm.index import Index, PhotoCache, read_index, read_pairs, write_index, write_pairs
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
+from corrsfm.mapping import reconstruct
 from corrsfm.resume import (
     StageOutcome,
     complete,
@@ -31,7 +31,6 @@ from corrsfm.resume import (
     mark_left_out,
     photos_left_out,
     refuse_vanished_photos,
-    require_database,
 )
 from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore, PrunedMatches, check_hloc_keys
 from corrsfm.summary import report
@@ -380,68 +379,6 @@ def verify_matches(
     return outcome
 
 
-def reconstruct(
-    workspace: Workspace, config: cfg.ReconstructionConfig, run: cfg.RunConfig, *, overwrite: bool = False
-) -> StageOutcome:
-    """Map the verified database into models, the largest at `sparse/0`.
-
-    Raises
-    ------
-    ReconstructionError
-        If no model came out, with the reason; models of earlier matches are then in ``sparse.old``.
-    """
-    from corrsfm.colmap import pycolmap_version
-    from corrsfm.reconstruction import reconstruct as map_database
-
-    started = time.monotonic()
-    verified = require_database(workspace)
-    fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
-    # Models without colours are made again once the photos are back.
-    black = config_hash("black", fingerprint)
-    images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
-    current = [fingerprint] if images_dir else [fingerprint, black]
-    if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
-        num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
-        return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
-    explain(workspace, "models", config)
-    workspace.forget("models")
-    names = read_index(workspace).names
-    if images_dir is None:
-        fingerprint = black
-        logger.warning(
-            "photos are no longer at %s; the points stay black; tell where they are now with: %s",
-            workspace.images_dir,
-            workspace.command_for("images", images_dir="NEWDIR"),
-        )
-    _warn_of_parts(workspace, names)
-    with tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar:
-
-        def on_progress(num_registered: int) -> None:
-            # Another model, or another try at the same one, begins.
-            if num_registered < bar.n:
-                bar.reset()
-            bar.n = num_registered
-            bar.refresh()
-
-        try:
-            models = map_database(
-                workspace.database,
-                images_dir,
-                workspace.sparse,
-                config=config,
-                seed=run.seed,
-                num_threads=count_threads(run.threads),
-                log_file=workspace.log,
-                on_progress=on_progress,
-            )
-        except ReconstructionError:
-            workspace.put_models_aside()
-            raise
-    outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
-    finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
-    return outcome
-
-
 def _without(names: set[str], pair_list: PairList) -> PairList:
     """The pairs of a list that are of other photos than these."""
     kept = [number for number, pair in enumerate(pair_list.pairs) if names.isdisjoint(pair)]
@@ -457,27 +394,6 @@ def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
     text = describe_components(names, pair_list.pairs)
     if text:
         logger.warning("%s", text)
-
-
-def _warn_of_parts(workspace: Workspace, names: list[str]) -> None:
-    """Warn before mapping if the verified pairs do not connect the photos that have any."""
-    from corrsfm.database import names_of_verified_pairs
-    from corrsfm.pairs import connected_components
-
-    parts = [
-        part
-        for part in connected_components(names, names_of_verified_pairs(workspace.database))
-        if len(part) > 1
-    ]
-    if len(parts) > 1:
-        logger.warning(
-            "verified pairs fall into %d components of %s photos: each becomes a model of its own at best; "
-            "add photos that bridge them, or try more features or more pairs\n"
-            "not connected to the largest: %s",
-            len(parts),
-            first_few(str(len(part)) for part in parts),
-            first_few(name for part in parts[1:] for name in part),
-        )
 
 
 def _content(path: Path) -> str:

@@ -103,6 +103,7 @@ def test_mapping_nothing_ends_with_the_reason_and_a_code(scene: Path) -> None:
     result = invoke("-q", "reconstruct", scene)
     assert result.exit_code == 1
     assert "no model could be made" in result.stderr and "--min-num-inliers" in result.stderr
+    assert result.stderr.endswith(f"\nevery photo and pair: corrsfm report {scene}\n")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from photos import write_photo, write_photos
 
-from corrsfm import colmap, features, files, images, index, pipeline, reconstruction
+from corrsfm import colmap, features, files, images, index, mapping, pipeline, reconstruction
 from corrsfm import config as cfg
 from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
 from corrsfm.index import read_index, read_pairs
@@ -506,7 +506,7 @@ def test_the_bar_of_mapping_starts_again_with_the_count(
 ) -> None:
     shown: list[int | str] = []
 
-    class Bar(pipeline.tqdm):
+    class Bar(mapping.tqdm):
         def refresh(self, *arguments: object, **options: object) -> None:
             shown.append(self.n)
 
@@ -520,7 +520,7 @@ def test_the_bar_of_mapping_starts_again_with_the_count(
         return []
 
     verify(workspace, photos)
-    monkeypatch.setattr(pipeline, "tqdm", Bar)
+    monkeypatch.setattr(mapping, "tqdm", Bar)
     monkeypatch.setattr(reconstruction, "reconstruct", map_twice)
     pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
     assert shown[-6:] == [2, 3, 4, "again", 2, 3]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from corrsfm.cli.options import (
     pipeline_options,
     run_options,
 )
+from corrsfm.errors import ReconstructionError
 
 if TYPE_CHECKING:
     from corrsfm.pipeline import StageOutcome
@@ -162,7 +164,11 @@ def reconstruct(
     """
     from corrsfm import pipeline
 
-    _step(pipeline.reconstruct, workspace_dir, config, run, overwrite)
+    try:
+        _step(pipeline.reconstruct, workspace_dir, config, run, overwrite)
+    except ReconstructionError as error:
+        command = shlex.join(["corrsfm", "report", str(workspace_dir)])
+        raise ReconstructionError(f"{error}\nevery photo and pair: {command}") from error
     _print_report(workspace_dir, as_json)
 
 
