@@ -142,6 +142,15 @@ def test_recipes_build_their_networks(repository, name):
         assert config.channels == NetworkConfig().channels
 
 
+def test_the_second_part_of_the_small_recipe_continues_the_first(repository):
+    first, second = (
+        load_recipe(repository / "pipelines" / f"{name}.toml") for name in ("train_small", "train_small_more")
+    )
+    assert Path(second.train.initial) == first.train.output / "latest.pt"
+    assert second.network == {}
+    assert second.train.train_files == first.train.train_files
+
+
 def test_a_recipe_with_an_unknown_key_is_refused(tmp_path):
     (tmp_path / "a.toml").write_text("[train]\nlearning_rat = 1e-3\n")
     with pytest.raises(ConfigError, match="learning_rat"):
