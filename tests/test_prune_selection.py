@@ -29,14 +29,14 @@ def test_operating_points_keep_what_they_promise():
     pair = make_matches(100)
     pair = dataclasses.replace(pair, mutual=np.arange(100) % 2 == 0)
     scores = np.full(100, 0.2, np.float32)
-    scores[:30], scores[30:80] = 0.95, 0.4
-    assert np.flatnonzero(select_kept(pair, scores, OperatingPoint.POSE)).tolist() == list(range(30))
+    scores[:40], scores[40:80] = 0.95, 0.4
+    assert np.flatnonzero(select_kept(pair, scores, OperatingPoint.POSE)).tolist() == list(range(40))
     sfm = select_kept(pair, scores, OperatingPoint.SFM)
     assert np.flatnonzero(sfm).tolist() == list(range(0, 80, 2))
     # One confident mutual match less: the pair is doubtful, and only the confident ones stay.
     scores[0] = 0.69
     sfm = select_kept(pair, scores, OperatingPoint.SFM)
-    assert np.flatnonzero(sfm).tolist() == list(range(2, 30, 2))
+    assert np.flatnonzero(sfm).tolist() == list(range(2, 40, 2))
 
 
 def test_unseen_matches_are_scored_by_a_matrix_as_far_as_it_is_trusted():

@@ -151,7 +151,7 @@ class Pruner:
         self._max_batch_matches = max_batch_matches
         self._warned = False
         self.fingerprint = (
-            f"corradaptor-2 sha256={checkpoint_sha256} operating_point={operating_point} "
+            f"corradaptor-3 sha256={checkpoint_sha256} operating_point={operating_point} "
             f"max_candidates={max_candidates} dtype={self.dtype}"
         )
 

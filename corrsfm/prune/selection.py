@@ -14,7 +14,7 @@ __all__ = ["score_matches", "select_candidates", "select_kept"]
 POSE_MIN_SCORE = 0.5
 SFM_MIN_SCORE = 0.3
 CONFIDENT_SCORE = 0.7
-MIN_NUM_CONFIDENT = 15
+MIN_NUM_CONFIDENT = 20
 
 # Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
 MAX_RESIDUAL = 1e-4
@@ -81,8 +81,10 @@ def select_kept(
         Confidence of the network in each match, in [0, 1].
     operating_point : OperatingPoint
         ``pose``: score above 0.5. ``sfm``: mutual matches with a score above 0.3; of a pair with fewer than
-        15 above 0.7, which as a rule shows two places, only those. (Of 114 pairs of a validation scene that
-        share nothing, 110 passed COLMAP's verification without this.)
+        20 above 0.7, which as a rule shows two places, only those. (The network learned from overlapping
+        photos and finds some order everywhere: of 114 pairs of a validation scene that share nothing, 110
+        passed COLMAP's verification without this. Of 119 such pairs of two validation scenes 8 % have 20, of
+        449 that share 50 points or more 92 %.)
 
     Returns
     -------
