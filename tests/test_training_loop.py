@@ -84,7 +84,7 @@ def test_run_from_files_writes_a_network_that_says_where_it_comes_from(tmp_path)
     assert provenance["scenes"] == ["a"] and provenance["steps"] == 2 and provenance["seed"] == 0
     assert [row["step"] for row in rows] == [1, 2]
     assert (tmp_path / "run" / "log.csv").read_text().count("\n") == 3
-    with pytest.raises(ConfigError, match="holds a run already; go on with --resume"):
+    with pytest.raises(ConfigError, match="holds a run already; try --resume"):
         train(recipe, device=CPU)
     assert train(recipe, device=CPU, resume=True) == path
 

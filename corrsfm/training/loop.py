@@ -96,7 +96,7 @@ def train(
         if trainer.state_path.exists():
             if not resume:
                 raise ConfigError(
-                    f"{recipe.train.output}: holds a run already; go on with --resume, or choose another --output"
+                    f"{recipe.train.output}: holds a run already; try --resume or another --output"
                 )
             trainer.load()
         return trainer.run()
