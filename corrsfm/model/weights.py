@@ -84,7 +84,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
             ),
             licence="Apache-2.0",
             training_data="9,428 pairs of 54 photo scenes with COLMAP poses; the model card names them",
-            score="AUC@5° 69.8 against 66.8 of ratio + mutual, LO-RANSAC behind both, 240 validation pairs",
+            score="AUC@5° 69.5 against 66.8 of ratio + mutual, LO-RANSAC behind both, 240 validation pairs",
         ),
     )
 }
