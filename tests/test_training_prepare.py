@@ -125,6 +125,18 @@ def test_a_workspace_is_a_scene(small_scene, tmp_path):
     assert len(prepare_scene(tmp_path / "work", CONFIG).pairs) == 3
 
 
+def test_rendered_views_are_training_data(repository):
+    config = PrepareConfig(max_features=300, max_pairs_per_scene=4)
+    scene = prepare_scene(repository / "sample_scenes" / "courtyard", config)
+    pairs = [scene.pair(index) for index in range(len(scene.pairs))]
+    assert len(pairs) == 4
+    for pair in pairs:
+        distinctive = pair.mutual & (pair.ratios < 0.7)
+        # Exact cameras: distinctive matches lie on the true epipolar lines, most others do not.
+        assert pair.inliers()[distinctive].mean() > 0.8
+        assert pair.inliers()[~pair.mutual].mean() < 0.3
+
+
 def test_a_folder_without_a_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no COLMAP model"):
         prepare_scene(tmp_path, CONFIG)
