@@ -109,7 +109,7 @@ def test_a_run_bounded_by_time_ends_at_learning_rate_zero(data, tmp_path):
     rows = []
     recipe = make_recipe(tmp_path, max_minutes=0.03)
     Trainer(recipe, data, CPU, on_log=rows.append).run()
-    assert 60 * rows[-2]["minutes"] < 1.8 <= 60 * rows[-1]["minutes"]
+    assert rows[-2]["minutes"] <= 0.03 <= rows[-1]["minutes"]
     assert rows[-1]["learning_rate"] < rows[len(rows) // 2]["learning_rate"]
 
 

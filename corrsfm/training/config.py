@@ -107,7 +107,9 @@ class TrainConfig:
     checkpoint_minutes: float = option(
         5.0, "Time between checkpoints", unit="min", minimum=0, affects_result=False
     )
-    log_every: int = option(50, "Steps between lines of the log", minimum=1, affects_result=False)
+    log_every: int = option(
+        50, "Steps between lines of the log, a minute at most", minimum=1, affects_result=False
+    )
     tensorboard: bool = option(False, "Also log to TensorBoard, in the run's folder", affects_result=False)
     seed: int = option(0, "Seed of weights, batches and augmentation", minimum=0)
 

@@ -203,16 +203,20 @@ class Trainer:
         if self.rank == 0:
             self._write_recipe()
         started = time.monotonic() - 60.0 * self.minutes
-        last = {"save": self.minutes, "validate": self.minutes}
+        last = {"log": self.minutes, "save": self.minutes, "validate": self.minutes}
         sums: dict[str, float] = {}
+        num_steps = 0
         while (progress := self._agreed_progress()) < 1.0:
             losses = self.train_step(progress)
             self.minutes = (time.monotonic() - started) / 60.0
             for name, value in losses.items():
                 sums[name] = sums.get(name, 0.0) + value
-            if self.step % self.config.log_every == 0:
-                self._log({name: value / self.config.log_every for name, value in sums.items()}, progress)
-                sums = {}
+            num_steps += 1
+            # Steps may be slow: nobody should wait longer than a minute for a sign of life.
+            if self.step % self.config.log_every == 0 or self.minutes - last["log"] >= 1.0:
+                self._log({name: value / num_steps for name, value in sums.items()}, progress)
+                sums, num_steps = {}, 0
+                last["log"] = self.minutes
             if self.rank == 0 and self.minutes - last["save"] >= self.config.checkpoint_minutes:
                 self.save()
                 last["save"] = self.minutes
