@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
-from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
+from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
 from corrsfm.oanet import OANetPair, open_pairs, pinhole_parameters, select_per_scene
 from corrsfm.types import Camera
 
@@ -149,7 +149,7 @@ class CompactScene:
             camera1=self.cameras[image1],
             scene=self.name,
             log_scale_ratios=self.log_scales[key1] - self.log_scales[key0],
-            rotations=((turn + np.pi) % (2.0 * np.pi) - np.pi).astype(np.float32),
+            rotations=wrap_angles(turn),
         )
 
 

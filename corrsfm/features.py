@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap import pycolmap_version
 from corrsfm.config import Extractor, FeaturesConfig
+from corrsfm.geometry import wrap_angles
 from corrsfm.types import Features
 
 __all__ = ["algorithm_of", "create_extractor", "extract_features", "quantise_descriptors", "scaled_size"]
@@ -109,7 +110,7 @@ def extract_features(
     return Features(
         keypoints=geometry[order, :2].astype(np.float32),
         scales=geometry[order, 2].astype(np.float32),
-        orientations=_wrapped(geometry[order, 3]),
+        orientations=wrap_angles(geometry[order, 3]),
         scores=scores[order].astype(np.float32),
         descriptors=descriptors[order],
         image_size=(width, height),
@@ -227,10 +228,3 @@ def _inside_mask(points: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArra
     columns = np.clip(np.floor(points[:, 0]).astype(np.int64), 0, width - 1)
     rows = np.clip(np.floor(points[:, 1]).astype(np.int64), 0, height - 1)
     return mask[rows, columns]
-
-
-def _wrapped(angles: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Angles in radians as float32 in [-π, π)."""
-    wrapped = (np.mod(angles + np.pi, 2 * np.pi) - np.pi).astype(np.float32)
-    # float32(π) exceeds π: the largest values round up to it.
-    return np.where(wrapped >= np.float32(np.pi), -np.float32(np.pi), wrapped).astype(np.float32)

@@ -17,6 +17,7 @@ __all__ = [
     "relative_pose",
     "rotation_angle_deg",
     "symmetric_epipolar_distance_sq",
+    "wrap_angles",
 ]
 
 
@@ -119,3 +120,10 @@ def pose_error_deg(
     if not np.linalg.norm(np.asarray(translation, np.float64)) > 0:
         return rotation_error, 90.0
     return rotation_error, min(direction_error, 180.0 - direction_error)
+
+
+def wrap_angles(angles: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Angles in radians as float32 in [-π, π)."""
+    wrapped = (np.mod(angles + np.pi, 2 * np.pi) - np.pi).astype(np.float32)
+    # float32(π) exceeds π: the largest values round up to it.
+    return np.where(wrapped >= np.float32(np.pi), -np.float32(np.pi), wrapped).astype(np.float32)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.cameras import normalise_points
+from corrsfm.geometry import wrap_angles
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
 __all__ = ["SIDE_CHANNELS", "make_correspondences", "side_information"]
@@ -55,7 +56,7 @@ def make_correspondences(
         ratios=matches.ratios,
         mutual=matches.mutual,
         log_scale_ratios=log_scale_ratios.astype(np.float32),
-        rotations=((rotations + np.pi) % (2.0 * np.pi) - np.pi).astype(np.float32),
+        rotations=wrap_angles(rotations),
         camera0=camera0,
         camera1=camera1,
         name=name,
