@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from corrsfm.prune.classical import RatioPruner, select_ratio
+from corrsfm.prune.classical import RatioPruner
 from corrsfm.types import Correspondences, PruneResult
 
 __all__ = ["ENOUGH", "TOO_FEW", "CascadePruner"]
@@ -50,14 +50,13 @@ class CascadePruner:
 
     def __init__(self, network: Network, *, network_fingerprint: str, max_ratio: float) -> None:
         self._network = network
-        self._max_ratio = max_ratio
         self._ratio = RatioPruner(max_ratio)
         self.fingerprint = f"cascade-2 max_ratio={max_ratio!r} network=[{network_fingerprint}]"
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`. ``decided_by`` is ``ratio`` or ``network``."""
         results = self._ratio(pairs)
-        counts = [np.count_nonzero(select_ratio(pair, self._max_ratio)) for pair in pairs]
+        counts = [np.count_nonzero(result.inlier_mask) for result in results]
         doubtful = [index for index, count in enumerate(counts) if TOO_FEW <= count < ENOUGH]
         if doubtful:
             answers = self._network([pairs[index] for index in doubtful])
