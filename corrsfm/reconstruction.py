@@ -94,11 +94,11 @@ def reconstruct(
             options=_incremental_options(config, output, seed, num_threads),
             on_progress=on_progress or (lambda num_registered: None),
         )
-        _check_calibration(mapped.values())
         cut_off = _cut_off(config, time.monotonic() - started)
         models = _ranked(mapped.values(), config.min_model_size)
         if not models:
             raise ReconstructionError(f"{database}: {_why_no_model(graph, cut_off)}")
+        _check_calibration(models[0])
         if cut_off:
             logger.warning("%s; photos may be missing for that reason alone", cut_off)
         for number, model in enumerate(models):
@@ -247,7 +247,7 @@ def _map_with_held_intrinsics(
 
 
 def _largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+    return next(iter(_ranked(models, 0)), None)
 
 
 def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction) -> bool:
@@ -259,10 +259,9 @@ def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Recons
     return model is not None and size(model) > size(other)
 
 
-def _check_calibration(models: Iterable[pycolmap.Reconstruction]) -> None:
+def _check_calibration(model: pycolmap.Reconstruction) -> None:
     """Warn of a model that no cameras can have taken."""
-    model = _largest(models)
-    if model is not None and not is_plausible(model):
+    if not is_plausible(model):
         ratios = focal_length_ratios(model)
         logger.warning(
             "the model looks wrong: focal lengths from %.2g to %.2g times the longest side of photos that do "
