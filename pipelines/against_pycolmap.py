@@ -49,7 +49,7 @@ def timed(command: list[str]) -> tuple[float, float]:
 
 def largest_model(folder: Path) -> dict[str, float]:
     """Counts of the model with most photos below a folder."""
-    from corrsfm.colmap import summarise_model
+    from corrsfm.colmap.models import summarise_model
 
     import pycolmap  # isort: skip
 

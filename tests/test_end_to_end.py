@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from corrsfm.config import Mapper, PruneMethod
-from corrsfm.evaluation.scene import evaluate_scene
+from corrsfm.evaluation.scenes.score import evaluate_scene
 
 pytestmark = pytest.mark.slow
 

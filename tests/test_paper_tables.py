@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from two_view_pairs import make_pair
 
-from corrsfm.evaluation.methods import parse_method
-from corrsfm.oanet import write_pairs
+from corrsfm.evaluation.two_view.methods import parse_method
+from corrsfm.labelled.oanet import write_pairs
 
 RECIPE = "pipelines/paper_tables.sh"
 

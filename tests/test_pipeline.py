@@ -18,14 +18,22 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 from photos import write_photo, write_photos
 
-from corrsfm import colmap, features, files, images, index, mapping, pipeline, reconstruction
 from corrsfm import config as cfg
+from corrsfm import files, pipeline
+from corrsfm.colmap import log as colmap
+from corrsfm.colmap.models import read_models
 from corrsfm.errors import ImageError, InputError, ReconstructionError, WorkspaceError
-from corrsfm.index import read_index, read_pairs
-from corrsfm.run import run_scene
-from corrsfm.store import FEATURES, MATCHES, PRUNED, ItemStore
+from corrsfm.features import sift as features
+from corrsfm.features import stage as features_stage
+from corrsfm.images import cache
+from corrsfm.images import photos as images
+from corrsfm.pipeline import run_scene
+from corrsfm.reconstruction import stage as mapping
 from corrsfm.types import Correspondences, PruneResult
 from corrsfm.workspace import StageRecord, Workspace
+from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
+from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.store import ItemStore
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 SMALL = cfg.FeaturesConfig(max_features=60)
@@ -102,7 +110,7 @@ def test_unchanged_photos_are_not_even_opened_again(
             opened.append(path.name)
             return original(path)
 
-        monkeypatch.setattr(index, original.__name__, spy)
+        monkeypatch.setattr(cache, original.__name__, spy)
     write_photo(photos / "2.png", 85)
     before = read_index(workspace)
     pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
@@ -371,7 +379,7 @@ def test_a_left_out_photo_is_tried_again(
 
     read_image = images.read_image
     with monkeypatch.context() as patch:
-        patch.setattr(images, "read_image", fail_once)
+        patch.setattr(features_stage, "read_image", fail_once)
         assert pipeline.extract_features(workspace, SMALL, RUN).num_reused == 0
         written = workspace.features.stat().st_mtime_ns
         caplog.clear()
@@ -458,7 +466,7 @@ def test_a_killed_run_loses_few_pairs_of_a_slow_network(
             ]
 
     run_front(workspace, photos)
-    monkeypatch.setattr("corrsfm.prune.build_pruner", lambda config, **options: Keep())
+    monkeypatch.setattr("corrsfm.prune.stage.build_pruner", lambda config, **options: Keep())
     run = cfg.RunConfig(threads=2, device="cpu")
     pipeline.prune_matches(workspace, cfg.PruneConfig(method=method), run)
     assert seen == sizes
@@ -521,7 +529,7 @@ def test_the_bar_of_mapping_starts_again_with_the_count(
 
     verify(workspace, photos)
     monkeypatch.setattr(mapping, "tqdm", Bar)
-    monkeypatch.setattr(reconstruction, "reconstruct", map_twice)
+    monkeypatch.setattr(mapping, "map_database", map_twice)
     pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
     assert shown[-6:] == [2, 3, 4, "again", 2, 3]
 
@@ -546,7 +554,7 @@ def test_a_truncated_database_is_written_anew(
 
 
 def colours(workspace: Workspace) -> set[tuple[int, ...]]:
-    (model,) = colmap.read_models(workspace.sparse)
+    (model,) = read_models(workspace.sparse)
     return {tuple(point.color.tolist()) for point in model.points3D.values()}
 
 

@@ -73,8 +73,8 @@ def bench(
     Numbers marked × are ratios to that reference on the same matches: of pairs per second, and of peak
     memory.
     """  # fmt: skip
-    from corrsfm.benchmark import format_rows, run_benchmark
     from corrsfm.cli.evaluate import command_line
+    from corrsfm.evaluation.benchmark import format_rows, run_benchmark
     from corrsfm.evaluation.records import provenance, save_results
     from corrsfm.machine import count_threads, find_device, use_threads
 

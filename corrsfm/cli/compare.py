@@ -53,7 +53,7 @@ def compare(
     source = click.get_current_context().get_parameter_source("method")
     if source is ParameterSource.COMMANDLINE:
         raise click.UsageError("--method chooses one method; name those to compare with --methods")
-    from corrsfm.evaluation.compare import compare_methods
+    from corrsfm.evaluation.scenes.compare import compare_methods
     from corrsfm.evaluation.tables import render_table
 
     output = output or Path(f"compare_{images_dir.resolve().name}")

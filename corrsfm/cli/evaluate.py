@@ -96,8 +96,8 @@ def pose(
 
     FILE.h5 is in OANet's layout (YFCC100M, SUN3D) or comes from `corrsfm train prepare`.
     """
-    from corrsfm.evaluation.methods import CLASSICAL_METHODS
-    from corrsfm.evaluation.two_view import evaluate_pose
+    from corrsfm.evaluation.two_view.methods import CLASSICAL_METHODS
+    from corrsfm.evaluation.two_view.pose import evaluate_pose
 
     values = evaluate_pose(
         pairs_file,
@@ -133,7 +133,7 @@ def homography(
     """Homography of planes, on a folder in HPatches' layout."""
     from tqdm import tqdm
 
-    from corrsfm.evaluation.homography import evaluate_homography
+    from corrsfm.evaluation.two_view.homography import evaluate_homography
 
     with tqdm(unit="sequence") as bar:
 
@@ -168,7 +168,7 @@ def homography(
 @json_option
 def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
     """A reconstruction against known cameras. WORKSPACE may also be a COLMAP model."""
-    from corrsfm.evaluation.scene import evaluate_scene
+    from corrsfm.evaluation.scenes.score import evaluate_scene
 
     score = evaluate_scene(workspace_dir, ground_truth)
     if as_json:

@@ -16,6 +16,7 @@ import click
 from click.core import ParameterSource
 
 from corrsfm import config as cfg
+from corrsfm.config.fields import flag_of
 
 __all__ = [
     "OVERWRITE_KEY",
@@ -36,13 +37,9 @@ logger = logging.getLogger("corrsfm")
 F = typing.TypeVar("F", bound=Callable[..., Any])
 
 
-def _flag(entry: dataclasses.Field) -> str:
-    return "--" + entry.name.replace("_", "-")
-
-
 def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
     """One click option for one config field."""
-    flag = _flag(entry)
+    flag = flag_of(entry.name)
     inner = next(
         (a for a in typing.get_args(annotation) if a is not type(None) and a is not Ellipsis), annotation
     )
@@ -188,7 +185,7 @@ def _warn_of_idle(config: Any, given: Collection[str]) -> None:
         chosen = getattr(config, chooser)
         chosen = chosen if isinstance(chosen, tuple) else (chosen,)
         if not set(chosen) & set(choices):
-            idle.setdefault(f"--{chooser} {'+'.join(chosen)}", []).append(_flag(entry))
+            idle.setdefault(f"--{chooser} {'+'.join(chosen)}", []).append(flag_of(entry.name))
     for choice, flags in idle.items():
         logger.warning("%s: no effect with %s", ", ".join(flags), choice)
 

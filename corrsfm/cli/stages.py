@@ -21,8 +21,8 @@ from corrsfm.cli.options import (
 from corrsfm.errors import ReconstructionError
 
 if TYPE_CHECKING:
-    from corrsfm.pipeline import StageOutcome
     from corrsfm.report import SceneReport
+    from corrsfm.workspace.resume import StageOutcome
 
 __all__ = ["extract", "match", "pairs", "prune", "reconstruct", "report", "run"]
 
@@ -99,9 +99,9 @@ def pairs(
     workspace_dir: Path, config: cfg.PairsConfig, run: cfg.RunConfig, overwrite: bool, as_json: bool
 ) -> None:
     """Choose again which photos are matched."""
-    from corrsfm import pipeline
+    from corrsfm.pairs.stage import make_pairs
 
-    _show([_step(pipeline.make_pairs, workspace_dir, config, run, overwrite)], as_json)
+    _show([_step(make_pairs, workspace_dir, config, run, overwrite)], as_json)
 
 
 @click.command()
@@ -117,9 +117,9 @@ def match(
 
     Every keypoint gets its nearest neighbour, with its distance ratio and whether it is mutual.
     """
-    from corrsfm import pipeline
+    from corrsfm.matches.stage import match_pairs
 
-    _show([_step(pipeline.match_pairs, workspace_dir, config, run, overwrite)], as_json)
+    _show([_step(match_pairs, workspace_dir, config, run, overwrite)], as_json)
 
 
 @click.command()
@@ -140,11 +140,12 @@ def prune(
 
     What the method keeps of the putative matches is written to a COLMAP database and verified geometrically.
     """
-    from corrsfm import pipeline
+    from corrsfm.database.stage import verify_matches
+    from corrsfm.prune.stage import prune_matches
 
     outcomes = [
-        _step(pipeline.prune_matches, workspace_dir, config, run, overwrite),
-        _step(pipeline.verify_matches, workspace_dir, database, run, overwrite),
+        _step(prune_matches, workspace_dir, config, run, overwrite),
+        _step(verify_matches, workspace_dir, database, run, overwrite),
     ]
     _show(outcomes, as_json)
 
@@ -162,10 +163,10 @@ def reconstruct(
 
     Writes COLMAP models, the largest at sparse/0, and prints the statistics.
     """
-    from corrsfm import pipeline
+    from corrsfm.reconstruction.stage import reconstruct as map_verified
 
     try:
-        _step(pipeline.reconstruct, workspace_dir, config, run, overwrite)
+        _step(map_verified, workspace_dir, config, run, overwrite)
     except ReconstructionError as error:
         command = shlex.join(["corrsfm", "report", str(workspace_dir)])
         raise ReconstructionError(f"{error}\nevery photo and pair: {command}") from error
@@ -196,7 +197,7 @@ def run(
 
     Finished work is kept: after an interruption or a changed option, run the same command again.
     """
-    from corrsfm.run import run_scene
+    from corrsfm.pipeline import run_scene
 
     result = run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
     _show_report(result, as_json, workspace_dir / "report.html")
@@ -204,12 +205,12 @@ def run(
 
 def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> None:
     """Gather and show the statistics; report.json is written always, report.html if asked for."""
-    from corrsfm import pipeline
+    from corrsfm.report.stage import report as summarise
     from corrsfm.workspace import Workspace
 
     workspace = Workspace(workspace_dir)
     with workspace.lock():
-        result = pipeline.report(workspace, html=html)
+        result = summarise(workspace, html=html)
     _show_report(result, as_json, workspace.report_html if html else None)
 
 

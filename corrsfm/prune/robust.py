@@ -18,8 +18,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.cameras import to_pycolmap
-from corrsfm.colmap import colmap_log
+from corrsfm.colmap.cameras import to_pycolmap
+from corrsfm.colmap.log import colmap_log
 from corrsfm.geometry import symmetric_epipolar_distance_sq
 from corrsfm.types import Camera, Correspondences, TwoViewModel
 

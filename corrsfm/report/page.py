@@ -11,12 +11,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap import observation_errors
+from corrsfm.colmap.models import observation_errors
 from corrsfm.errors import DependencyError
 from corrsfm.files import atomic_write_text
 from corrsfm.report import charts, pictures
+from corrsfm.report.missing import MissingImage
 from corrsfm.report.model_view import ModelView, make_view, plotly_view
-from corrsfm.report.scene import MissingImage, SceneReport
+from corrsfm.report.statistics import SceneReport
 from corrsfm.report.style import STYLE
 from corrsfm.report.table import statistics_rows
 from corrsfm.types import PairStatistics

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from corrsfm.report.scene import SceneReport
+from corrsfm.report.statistics import SceneReport
 
 __all__ = ["format_table", "statistics_rows"]
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 from corrsfm.config import from_dict, option
+from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
 
 __all__ = [
@@ -141,12 +141,7 @@ def load_recipe(path: Path) -> TrainRecipe:
     ConfigError
         If the file is missing, not TOML, or holds a key or value that does not exist.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; expected a training recipe in TOML") from error
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path}: cannot be read as a training recipe in TOML ({error})") from error
+    values = load_toml(path, "a training recipe")
     network = values.pop("network", {})
     unknown = set(values) - {"train", "augment", "synthetic"}
     if unknown:

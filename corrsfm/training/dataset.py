@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from corrsfm.compact import CompactScene, is_compact, read_scenes
 from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, relative_pose
-from corrsfm.oanet import OANetPair, pinhole_parameters, read_pairs
+from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
+from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
 from corrsfm.training.config import AugmentConfig
 from corrsfm.training.losses import THRESHOLD, epipolar_distance_sq
 

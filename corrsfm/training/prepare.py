@@ -19,13 +19,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.cameras import camera_from_pycolmap, normalise_points
-from corrsfm.compact import NO_NEIGHBOUR, CompactScene, write_scenes
+from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
 from corrsfm.errors import ImageError, InputError, WorkspaceError
-from corrsfm.features import extract_features
-from corrsfm.images import read_image
-from corrsfm.matches import match_features
-from corrsfm.oanet import pinhole_parameters, write_pairs
+from corrsfm.features.sift import extract_features
+from corrsfm.images.photos import read_image
+from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
+from corrsfm.labelled.oanet import pinhole_parameters, write_pairs
+from corrsfm.matches.nearest import match_features
 from corrsfm.training.config import PrepareConfig
 from corrsfm.types import Camera, Features
 from corrsfm.workspace import Workspace

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.compact import read_labelled_pairs
 from corrsfm.errors import DependencyError
 from corrsfm.evaluation.metrics import pose_auc, precision_recall_f
 from corrsfm.geometry import pose_error_deg
+from corrsfm.labelled.compact import read_labelled_pairs
+from corrsfm.labelled.oanet import OANetPair
 from corrsfm.model import CorrAdaptor
-from corrsfm.oanet import OANetPair
 from corrsfm.prune.correspondences import side_information
 
 __all__ = ["Validation", "match_scores", "pose_error_after_loransac"]

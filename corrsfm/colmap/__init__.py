@@ -1,0 +1,1 @@
+"""Every conversation with pycolmap's data: its log, cameras, databases and models."""

@@ -1,0 +1,69 @@
+"""How corrsfm talks to pycolmap: a quiet log, failures in plain words, and models in numbers.
+
+pycolmap's log is one per process (glog), so `colmap_log` is not for use from several threads at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pycolmap
+
+__all__ = ["colmap_log", "pycolmap_version"]
+
+# Importing pycolmap makes SIGTERM print a stack trace of native code, as if something had crashed; this gives
+# the signal back the meaning that it had. Only the main thread may.
+with contextlib.suppress(ValueError):
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
+
+_SILENT = 3
+
+
+def pycolmap_version() -> str:
+    """Major and minor version, between which results may differ; for fingerprints."""
+    return ".".join(pycolmap.__version__.split(".")[:2])
+
+
+@contextlib.contextmanager
+def colmap_log(log_file: Path | None = None) -> Iterator[None]:
+    """Keep pycolmap quiet; collect what it has to say in a file.
+
+    Parameters
+    ----------
+    log_file : Path, optional
+        The messages are appended to it when the block ends, also when it fails. Without it they are dropped;
+        pycolmap's own default would be the terminal and files in the temporary folder of the machine.
+    """
+    log = pycolmap.logging
+    before = (log.minloglevel, log.alsologtostderr, log.logtostderr)
+    log.alsologtostderr = log.logtostderr = False
+    log.minloglevel = _SILENT if log_file is None else 0
+    try:
+        if log_file is None:
+            yield
+        else:
+            with tempfile.TemporaryDirectory(prefix="corrsfm-log-") as folder:
+                # One file for all levels: messages of a level go to the files of all lower levels, too.
+                log.set_log_destination(log.INFO, str(Path(folder) / "colmap."))
+                for level in (log.WARNING, log.ERROR, log.FATAL):
+                    log.set_log_destination(level, "")
+                try:
+                    yield
+                finally:
+                    # Closing the destination flushes it.
+                    log.set_log_destination(log.INFO, "")
+                    _append(sorted(Path(folder).iterdir()), log_file)
+    finally:
+        log.minloglevel, log.alsologtostderr, log.logtostderr = before
+
+
+def _append(sources: list[Path], target: Path) -> None:
+    # glog also leaves a link named after the program beside its file.
+    texts = [source.read_bytes() for source in sources if source.is_file() and not source.is_symlink()]
+    # A log that cannot be written, on a full disk say, must not hide the error that is being logged.
+    with contextlib.suppress(OSError), open(target, "ab") as file:
+        file.write(b"".join(texts))

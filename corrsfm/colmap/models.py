@@ -1,0 +1,87 @@
+"""COLMAP models: reading them, and in numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.colmap.log import colmap_log
+from corrsfm.errors import WorkspaceError
+from corrsfm.types import ModelSummary
+
+__all__ = ["observation_errors", "read_models", "summarise_model"]
+
+
+def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
+    """Read the models ``folder/0``, ``folder/1`` … in this order.
+
+    Raises
+    ------
+    WorkspaceError
+        If there is none, or one cannot be read.
+    """
+    models: list[pycolmap.Reconstruction] = []
+    while (path := folder / str(len(models))).is_dir():
+        try:
+            with colmap_log():
+                models.append(pycolmap.Reconstruction(path))
+        except (RuntimeError, ValueError) as error:
+            raise WorkspaceError(
+                f"{path}: is not a readable COLMAP model; try: corrsfm reconstruct --overwrite"
+            ) from error
+    if not models:
+        raise WorkspaceError(f"{folder}: holds no model; try: corrsfm reconstruct")
+    return models
+
+
+def observation_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+    """Reprojection error of every observation of a model.
+
+    Returns
+    -------
+    (O,) float64
+        Distances in pixels between keypoint and projected point, images in order of their names. Infinite
+        for a point behind its camera.
+    """
+    errors = [np.zeros(0)]
+    # One pass over the points: asking pycolmap for the point of each observation takes twice as long.
+    point_ids = np.array(sorted(model.points3D), np.uint64)
+    positions = np.array([model.points3D[int(point_id)].xyz for point_id in point_ids]).reshape(-1, 3)
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        if not image.has_pose:
+            continue
+        observed = image.get_observation_points2D()
+        if not observed:
+            continue
+        keypoints = np.array([point.xy for point in observed])
+        observed_ids = np.array([point.point3D_id for point in observed], np.uint64)
+        in_camera = image.cam_from_world() * positions[np.searchsorted(point_ids, observed_ids)]
+        projected = np.full_like(keypoints, np.inf)
+        front = in_camera[:, 2] > 0
+        projected[front] = image.camera.img_from_cam(in_camera[front])
+        errors.append(np.linalg.norm(projected - keypoints, axis=1))
+    return np.concatenate(errors)
+
+
+def summarise_model(model: pycolmap.Reconstruction) -> ModelSummary:
+    """A model in numbers."""
+    errors = observation_errors(model)
+    num_images = model.num_reg_images()
+    # Without points all of them are undefined.
+    mean, median, p95 = (
+        (errors.mean(), *np.percentile(errors, [50, 95])) if len(errors) else (np.nan, np.nan, np.nan)
+    )
+    num_observations = model.compute_num_observations()
+    return ModelSummary(
+        image_names=tuple(sorted(image.name for image in model.images.values() if image.has_pose)),
+        num_points=model.num_points3D(),
+        num_observations=num_observations,
+        mean_track_length=num_observations / max(model.num_points3D(), 1),
+        mean_observations_per_image=num_observations / max(num_images, 1),
+        mean_error_px=float(mean),
+        median_error_px=float(median),
+        p95_error_px=float(p95),
+    )

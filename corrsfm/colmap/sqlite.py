@@ -1,0 +1,127 @@
+"""COLMAP's database as a file: is it whole, and what its failures mean."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+from corrsfm.errors import DatabaseError
+
+__all__ = ["database_errors", "is_sqlite", "is_truncated"]
+
+
+_SMALLEST_DISK_BYTES = 1 << 20
+
+
+_MAGIC = b"SQLite format 3\0"
+
+
+_HEADER_BYTES = 100
+
+
+@contextlib.contextmanager
+def database_errors(path: Path, shown: Path | None = None) -> Iterator[None]:
+    """Translate what pycolmap says about a database into a `DatabaseError` with what to try.
+
+    Parameters
+    ----------
+    path : Path
+        The database that the block works on.
+    shown : Path, optional
+        What to call it in the message, if it has another name while it is made.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        explanation = _explain(path, str(error))
+        if explanation is None:
+            raise
+        raise DatabaseError(f"{shown or path}: {explanation}") from error
+
+
+def _explain(path: Path, message: str) -> str | None:
+    """Cause and remedy of a message of pycolmap's database; None if it is about something else."""
+    if "disk is full" in message or "disk I/O error" in message:
+        return _FULL
+    if "database is locked" in message:
+        return _HELD
+    if "readonly database" in message:
+        return "cannot be written; check the permissions of the file and its folder"
+    if "No registered database factory" in message:
+        return _explain_unopened(path)
+    if "SQLite error" in message:
+        return f"{message.rpartition('SQLite error: ')[2]}; delete the file and make it again"
+    return None
+
+
+_FULL = "the disk is full or failing; free some space and run the same command again"
+
+
+_HELD = "is in use by another program; close it there (COLMAP, another corrsfm) and try again"
+
+
+def _explain_unopened(path: Path) -> str:
+    if not path.parent.is_dir():
+        return "its folder does not exist"
+    if path.is_dir():
+        return "is a folder, expected a COLMAP database"
+    if path.exists() and path.stat().st_size:
+        try:
+            is_database = is_sqlite(path)
+        except OSError as error:
+            return f"cannot be read ({error.strerror})"
+        if not is_database:
+            return "is not a COLMAP database; move it away and make it again"
+    if shutil.disk_usage(path.parent).free < _SMALLEST_DISK_BYTES:
+        return _FULL
+    try:
+        if _is_locked(path):
+            return _HELD
+    except sqlite3.DatabaseError as error:
+        return f"damaged ({error}); delete the file and make it again"
+    return "cannot be opened; check the free space of the disk and the permissions of the file and its folder"
+
+
+def is_sqlite(path: Path) -> bool:
+    """Whether a file begins like an SQLite database."""
+    with open(path, "rb") as file:
+        return file.read(len(_MAGIC)) == _MAGIC
+
+
+def is_truncated(path: Path) -> bool:
+    """Whether an SQLite database lacks bytes that its header promises; also so of an empty file.
+
+    Quick whatever the size of the file, because only the header is read; what was damaged in its place is not
+    found. False for a file that is no SQLite database at all.
+    """
+    size = path.stat().st_size
+    with open(path, "rb") as file:
+        header = file.read(_HEADER_BYTES)
+    if len(header) < _HEADER_BYTES:
+        return _MAGIC.startswith(header[: len(_MAGIC)])
+    page_size, num_pages = (int.from_bytes(header[start:end]) for start, end in ((16, 18), (28, 32)))
+    # The number of pages counts only if whoever wrote last wrote it, too.
+    counted = header[24:28] == header[92:96]
+    return (
+        header.startswith(_MAGIC) and counted and size < num_pages * (65536 if page_size == 1 else page_size)
+    )
+
+
+def _is_locked(path: Path) -> bool:
+    """Whether another process holds a lock; only asked once pycolmap has given up on the file.
+
+    Raises
+    ------
+    sqlite3.DatabaseError
+        If the file is damaged.
+    """
+    try:
+        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True, timeout=0)) as connection:
+            connection.execute("BEGIN IMMEDIATE")
+            connection.rollback()
+    except sqlite3.OperationalError as error:
+        return "locked" in str(error)
+    return False

@@ -1,0 +1,47 @@
+"""The options of every stage, and how flags, TOML files and hashes come from the same fields."""
+
+from corrsfm.config.fields import LARGEST_INT, config_hash, from_dict, option, to_dict
+from corrsfm.config.stages import (
+    CameraMode,
+    DatabaseConfig,
+    Extractor,
+    FeaturesConfig,
+    ImagesConfig,
+    Mapper,
+    MatchesConfig,
+    OperatingPoint,
+    PairsConfig,
+    PairStrategy,
+    PipelineConfig,
+    Precision,
+    PruneConfig,
+    PruneMethod,
+    ReconstructionConfig,
+    RunConfig,
+    load_pipeline,
+)
+
+__all__ = [
+    "LARGEST_INT",
+    "CameraMode",
+    "DatabaseConfig",
+    "Extractor",
+    "FeaturesConfig",
+    "ImagesConfig",
+    "Mapper",
+    "MatchesConfig",
+    "OperatingPoint",
+    "PairStrategy",
+    "PairsConfig",
+    "PipelineConfig",
+    "Precision",
+    "PruneConfig",
+    "PruneMethod",
+    "ReconstructionConfig",
+    "RunConfig",
+    "config_hash",
+    "from_dict",
+    "load_pipeline",
+    "option",
+    "to_dict",
+]

@@ -1,0 +1,1 @@
+"""The COLMAP database: writing it and verifying its pairs."""

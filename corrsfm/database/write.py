@@ -1,0 +1,266 @@
+"""Features and pruned matches → a COLMAP database with verified two-view geometries.
+
+Everything goes through pycolmap's API, so the schema is always the one that pycolmap expects. Verification
+is `pycolmap.geometric_verification`, which estimates geometries from the matches that are there; its
+neighbour `verify_matches` would match the descriptors of pruned-away pairs again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.sqlite import database_errors, is_sqlite
+from corrsfm.config import DatabaseConfig
+from corrsfm.database.verification import default_verification_error_px, verify_pairs
+from corrsfm.errors import DatabaseError, InputError
+from corrsfm.files import atomic_path
+from corrsfm.types import Camera, Features, ImageRecord
+
+__all__ = ["DatabaseSummary", "write_database"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatabaseSummary:
+    """What a database holds.
+
+    Attributes
+    ----------
+    num_images, num_keypoints : int
+    num_pairs : int
+        Pairs on record, those pruned to nothing included.
+    num_empty_pairs : int
+        Pairs pruned to nothing.
+    num_matches : int
+        Matches over all pairs.
+    num_duplicates : int
+        Repeated matches that were left out.
+    num_verified_pairs, num_inliers : int
+        Pairs with a two-view geometry, and the matches that agree with it.
+    """
+
+    num_images: int
+    num_keypoints: int
+    num_pairs: int
+    num_empty_pairs: int
+    num_matches: int
+    num_duplicates: int
+    num_verified_pairs: int
+    num_inliers: int
+
+
+def write_database(
+    path: Path,
+    *,
+    images: Sequence[ImageRecord],
+    cameras: Sequence[Camera],
+    features: Callable[[str], Features],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    config: DatabaseConfig,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+) -> DatabaseSummary:
+    """Write and verify a database; it appears at ``path`` whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        An existing database there is replaced.
+    images : sequence of ImageRecord
+        Written in order of their names; positions from GPS become pose priors.
+    cameras : sequence of Camera
+        What the images' ``camera_id`` points into.
+    features : callable
+        Image name → `Features`; called once an image.
+    pruned : iterable of (str, str, (K, 2) int32)
+        Two image names and the indices of the kept matches; K may be 0, and the pair stays on record.
+    config : DatabaseConfig
+    seed : int
+        Seed of the robust estimation.
+    num_threads : int
+        Threads of the verification, on which results do not depend; 0 for all cores.
+    log_file : Path, optional
+        Where pycolmap's messages are appended.
+
+    Raises
+    ------
+    InputError
+        If a pair names an unknown photo, a photo twice or keypoints that do not exist, or occurs twice.
+    DatabaseError
+        If the database cannot be written, or the one to be replaced is in use.
+    """
+    _check_not_in_use(path)
+    with atomic_path(path) as temporary:
+        for suffix in ("-wal", "-shm"):
+            temporary.with_name(temporary.name + suffix).unlink(missing_ok=True)
+        with colmap_log(), database_errors(temporary, path):
+            num_duplicates, num_empty = _fill(
+                temporary, images, cameras, features, pruned, config.write_descriptors
+            )
+        with colmap_log(log_file), database_errors(temporary, path):
+            max_error_px = config.verification_error_px or default_verification_error_px(cameras)
+            verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
+        with colmap_log(), database_errors(temporary, path), pycolmap.Database.open(temporary) as database:
+            # A pair whose verification failed has a row without inliers.
+            _, num_inliers = database.read_two_view_geometry_num_inliers()
+            summary = DatabaseSummary(
+                num_images=database.num_images(),
+                num_keypoints=database.num_keypoints(),
+                num_pairs=database.num_matched_image_pairs(),
+                num_empty_pairs=num_empty,
+                num_matches=database.num_matches(),
+                num_duplicates=num_duplicates,
+                num_verified_pairs=sum(num > 0 for num in num_inliers),
+                num_inliers=sum(num_inliers),
+            )
+    return summary
+
+
+def _check_not_in_use(path: Path) -> None:
+    """Refuse to replace a database that another process has open.
+
+    Its write-ahead log would stay beside the new file, and SQLite would replay it there.
+    """
+    side_files = [path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal")]
+    if path.is_file() and not any(file.exists() for file in side_files):
+        if path.stat().st_size and not is_sqlite(path):
+            raise DatabaseError(f"{path}: is not a COLMAP database; move it away and try again")
+        return
+    # Opening and closing settles what a killed process has left.
+    with colmap_log(), database_errors(path):
+        if path.exists():
+            pycolmap.Database.open(path).close()
+    if any(file.exists() for file in side_files):
+        raise DatabaseError(
+            f"{path}: is in use by another program; close it there (COLMAP, another corrsfm) and try again"
+        )
+
+
+def _fill(
+    path: Path,
+    images: Sequence[ImageRecord],
+    cameras: Sequence[Camera],
+    features: Callable[[str], Features],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    write_descriptors: bool,
+) -> tuple[int, int]:
+    """Write all tables but the geometries; numbers of repeated matches and of empty pairs."""
+    # COLMAP's verification reads the file through another connection, so it has to be closed before.
+    with pycolmap.Database.open(path) as database:
+        transaction = pycolmap.DatabaseTransaction(database)
+        try:
+            camera_ids = [_write_camera(database, camera) for camera in cameras]
+            num_keypoints: dict[str, int] = {}
+            image_ids: dict[str, int] = {}
+            for image in sorted(images, key=lambda image: image.name):
+                image_id = _write_image(database, image, camera_ids[image.camera_id])
+                image_features = features(image.name)
+                _write_features(database, image_id, image.name, image_features, write_descriptors)
+                image_ids[image.name] = image_id
+                num_keypoints[image.name] = len(image_features)
+            return _write_pairs(database, image_ids, num_keypoints, pruned)
+        finally:
+            # The transaction ends when its object goes; the database must be open then.
+            del transaction
+
+
+def _write_camera(database: pycolmap.Database, camera: Camera) -> int:
+    """Write a camera and the rig that COLMAP wants around it; its id."""
+    written = pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    written.has_prior_focal_length = camera.has_prior_focal_length
+    written.camera_id = database.write_camera(written)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(written.sensor_id)
+    rig.rig_id = written.camera_id
+    database.write_rig(rig, use_rig_id=True)
+    return written.camera_id
+
+
+def _write_image(database: pycolmap.Database, image: ImageRecord, camera_id: int) -> int:
+    """Write an image, its frame and its GPS position; its id."""
+    written = pycolmap.Image(name=image.name, camera_id=camera_id)
+    written.image_id = database.write_image(written)
+    frame = pycolmap.Frame()
+    frame.rig_id = camera_id
+    frame.add_data_id(written.data_id)
+    database.write_frame(frame)
+    if image.gps is not None:
+        prior = pycolmap.PosePrior(
+            corr_data_id=written.data_id,
+            position=np.array(image.gps, np.float64),
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.WGS84,
+        )
+        database.write_pose_prior(prior)
+    return written.image_id
+
+
+def _write_features(
+    database: pycolmap.Database, image_id: int, name: str, features: Features, write_descriptors: bool
+) -> None:
+    if not np.isfinite(features.keypoints).all():
+        raise InputError(f"{name}: a keypoint is not a finite number; extract its features again")
+    keypoints = np.column_stack([features.keypoints, features.scales, features.orientations])
+    database.write_keypoints(image_id, np.ascontiguousarray(keypoints, np.float32))
+    if write_descriptors:
+        database.write_descriptors(
+            image_id,
+            pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors),
+        )
+
+
+def _write_pairs(
+    database: pycolmap.Database,
+    image_ids: dict[str, int],
+    num_keypoints: dict[str, int],
+    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+) -> tuple[int, int]:
+    """Write the matches of all pairs; numbers of repeated matches and of empty pairs."""
+    num_duplicates = num_empty = 0
+    for name0, name1, indices in pruned:
+        _check_pair(database, image_ids, num_keypoints, name0, name1, indices)
+        # COLMAP would drop a repeated row later, with a warning for each.
+        _, first = np.unique(indices, axis=0, return_index=True)
+        unique = indices[np.sort(first)]
+        num_duplicates += len(indices) - len(unique)
+        num_empty += len(unique) == 0
+        database.write_matches(image_ids[name0], image_ids[name1], unique.astype(np.uint32))
+    return num_duplicates, num_empty
+
+
+def _check_pair(
+    database: pycolmap.Database,
+    image_ids: dict[str, int],
+    num_keypoints: dict[str, int],
+    name0: str,
+    name1: str,
+    indices: NDArray[np.int32],
+) -> None:
+    """Catch what pycolmap would take without a word, or answer with "constraint failed"."""
+    pair = f"pair {name0} – {name1}"
+    for name in (name0, name1):
+        if name not in image_ids:
+            raise InputError(f"{pair}: {name} is not among the photos; make the pairs and matches again")
+    if name0 == name1:
+        raise InputError(f"{pair}: a photo cannot be matched with itself; remove the pair from the list")
+    if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
+        raise InputError(
+            f"{pair}: matches are {indices.dtype} of shape {indices.shape}, expected integers (K, 2)"
+        )
+    for name, column in ((name0, indices[:, 0]), (name1, indices[:, 1])):
+        if len(column) and (column.min() < 0 or column.max() >= num_keypoints[name]):
+            wrong = int(column.min() if column.min() < 0 else column.max())
+            raise InputError(
+                f"{pair}: a match uses keypoint {wrong} of {name}, which has {num_keypoints[name]}; "
+                "the matches belong to other features, match and prune again"
+            )
+    if database.exists_matches(image_ids[name0], image_ids[name1]):
+        raise InputError(f"{pair}: occurs twice; remove one of them from the list of pairs")

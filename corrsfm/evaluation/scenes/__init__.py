@@ -1,0 +1,1 @@
+"""Whole reconstructions against known cameras, and against each other."""

@@ -1,0 +1,166 @@
+"""The page of a comparison: the table, and the pairs that the methods disagree about most, drawn."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.files import atomic_write_text
+from corrsfm.types import Pair
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
+from corrsfm.workspace.lists import read_pairs
+from corrsfm.workspace.store import ItemStore
+
+__all__ = ["write_page"]
+
+_NUM_DRAWN_PAIRS = 4
+_PHOTO_SIZE = 360
+
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
+body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem }
+table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums }
+th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom }
+th:first-child, td:first-child { text-align: left }
+.best { font-weight: 600 }
+.failure { color: #a33 } td.failure { text-align: left }
+.wide { overflow-x: auto }
+.pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(24rem, 1fr)); gap: 1rem }
+figure { margin: 0 } img { max-width: 100% } figcaption, .note { color: #555; font-size: .9em }
+.kept { color: #2a7fb8 } .dropped { color: #d55e00 }
+"""
+
+_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
+    # heading, value, decimals, and +1 / -1 where more / less is better
+    ("kept matches", lambda m: m["num_kept_matches"], 0, 0),
+    ("verified pairs", lambda m: m["num_verified_pairs"], 0, 1),
+    ("inlier ratio", lambda m: m["inlier_ratio"], 2, 1),
+    ("photos", lambda m: m["num_registered"], 0, 1),
+    ("models", lambda m: m["num_models"], 0, 0),
+    ("points", lambda m: m["num_points"], 0, 1),
+    ("track length", lambda m: m["mean_track_length"], 2, 1),
+    ("error px", lambda m: m["mean_error_px"], 2, 0),
+    ("prune s", lambda m: m["seconds"]["prune"], 1, -1),
+    ("verify s", lambda m: m["seconds"]["verify"], 1, -1),
+    ("map s", lambda m: m["seconds"]["map"], 1, -1),
+)
+_TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
+    ("AUC@1°", lambda m: m["ground_truth"]["auc"]["1"], 1, 1),
+    ("AUC@5°", lambda m: m["ground_truth"]["auc"]["5"], 1, 1),
+    ("AUC@10°", lambda m: m["ground_truth"]["auc"]["10"], 1, 1),
+    ("position error %", lambda m: m["ground_truth"]["position_error_percent"], 2, -1),
+)
+
+
+def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: dict[str, Workspace]) -> None:
+    """Write the page, one file without links to others.
+
+    Parameters
+    ----------
+    path : Path
+    values : dict
+        Content of the result file of kind ``compare``.
+    base : Workspace
+        With features and putative matches.
+    workspaces : dict
+        Method to its workspace.
+    """
+    subject = values["subject"]
+    versions = ", ".join(f"{name} {version}" for name, version in values["provenance"]["versions"].items())
+    title = f"{escape(subject['name'])}: prune methods compared"
+    parts = [
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
+        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
+        f"<h1>{title}</h1>",
+        f"<p>{subject['num_photos']} photos, {subject['num_pairs']} pairs; the same features and matches for "
+        "every method. Numbers of the largest model; the best of a column is bold.</p>",
+        _table(values["methods"]),
+        "<h2>Pairs that differ most</h2>",
+        "<p class='note'>By number of verified matches. <span class='kept'>Blue: kept</span>, "
+        "<span class='dropped'>orange: dropped</span>; at most 150 and 60 are drawn.</p>",
+        *_drawn_pairs(values["pairs"][:_NUM_DRAWN_PAIRS], base, workspaces),
+        f"<p class='note'>{escape(versions)}; seed {values['provenance']['seed']}. "
+        f"{escape(values['provenance']['command'])}</p></body></html>",
+    ]
+    atomic_write_text(path, "\n".join(parts))
+
+
+def _table(methods: dict[str, Any]) -> str:
+    columns = list(_COLUMNS)
+    if all(method["ground_truth"] for method in methods.values()):
+        columns += _TRUTH_COLUMNS
+    best = [_best([value(m) for m in methods.values()], sense) for _, value, _, sense in columns]
+    head = "".join(f"<th>{escape(heading)}</th>" for heading, *_ in columns)
+    rows = []
+    for name, method in methods.items():
+        cells = []
+        for (_, value, decimals, _), winner in zip(columns, best, strict=True):
+            number = value(method)
+            text = "–" if number is None else f"{number:,.{decimals}f}"
+            kind = " class='best'" if number is not None and number == winner else ""
+            cells.append(f"<td{kind}>{text}</td>")
+        rows.append(f"<tr><td>{escape(name)}</td>{''.join(cells)}</tr>")
+        if method["failure"]:
+            rows.append(
+                f"<tr><td class='failure' colspan='{len(columns) + 1}'>{escape(method['failure'])}</td></tr>"
+            )
+    return f"<div class='wide'><table><tr><th>method</th>{head}</tr>{''.join(rows)}</table></div>"
+
+
+def _best(numbers: Sequence[float | None], sense: int) -> float | None:
+    """The best number, None where none is better than another."""
+    known = [number for number in numbers if number is not None]
+    if sense == 0 or len(set(known)) < 2:
+        return None
+    return max(known) if sense > 0 else min(known)
+
+
+def _drawn_pairs(
+    rows: Sequence[dict[str, Any]], base: Workspace, workspaces: dict[str, Workspace]
+) -> list[str]:
+    """One section per pair with a picture per method."""
+    from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
+
+    oriented = {frozenset(pair): pair for pair in read_pairs(base).pairs}
+    features, putative = ItemStore(base.features, FEATURES), ItemStore(base.matches, MATCHES)
+    photo = functools.lru_cache(maxsize=2 * _NUM_DRAWN_PAIRS)(
+        lambda name: read_photo(base.images_dir / name, _PHOTO_SIZE)
+    )
+    sections = []
+    for row in rows:
+        pair = oriented[frozenset((row["name0"], row["name1"]))]
+        photos = [photo(name) for name in pair]
+        if photos[0] is None or photos[1] is None:
+            continue
+        indices = putative.read(pair).indices
+        points = tuple(features.read(name).keypoints[indices[:, side]] for side, name in enumerate(pair))
+        figures = []
+        for method, workspace in workspaces.items():
+            picture = draw_matches(
+                (photos[0][0], photos[1][0]),
+                (photos[0][1], photos[1][1]),
+                (points[0], points[1]),
+                _kept_mask(workspace, pair, indices),
+            )
+            kept, verified = row["kept_and_verified"][method]
+            figures.append(
+                f"<figure><img src='{jpeg_uri(picture)}' alt='matches kept by {escape(method)}'>"
+                f"<figcaption>{escape(method)}: {len(indices)} → {kept} kept → {verified} verified"
+                "</figcaption></figure>"
+            )
+        sections.append(
+            f"<h3>{escape(pair[0])} – {escape(pair[1])}</h3><div class='pair'>{''.join(figures)}</div>"
+        )
+    return sections
+
+
+def _kept_mask(workspace: Workspace, pair: Pair, indices: NDArray[np.int32]) -> NDArray[np.bool_]:
+    # Column 0 of putative matches strictly increases, so it identifies a match.
+    return np.isin(indices[:, 0], ItemStore(workspace.pruned, PRUNED).read(pair).indices[:, 0])

@@ -1,0 +1,1 @@
+"""Methods on pairs of photos with known relative pose or homography."""

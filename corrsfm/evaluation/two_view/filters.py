@@ -1,0 +1,190 @@
+"""Filters of putative matches under one interface: what is kept before a pose is estimated.
+
+A filter is named by a short text, see `parse_filter`; a class that keeps the protocol plugs another one in.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.config import OperatingPoint, PruneConfig, PruneMethod
+from corrsfm.errors import ConfigError
+from corrsfm.labelled.oanet import OANetPair
+from corrsfm.types import PruneResult
+
+__all__ = ["OracleFilter", "PairFilter", "PrunerFilter", "SideFilter", "parse_filter", "parse_prune_method"]
+
+
+class PairFilter(Protocol):
+    """A filter of putative matches.
+
+    Attributes
+    ----------
+    name : str
+        What `parse_filter` makes it from.
+    fingerprint : str
+        Changes whenever results may: options and the hash of a checkpoint.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def fingerprint(self) -> str: ...
+
+    def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
+        """One result per pair, in order; matches of a pair in order; pairs without matches included."""
+
+
+def _result(pair: OANetPair, keep: NDArray[np.bool_], name: str) -> PruneResult:
+    scores = np.where(keep, 1.0 - np.clip(np.nan_to_num(pair.ratios, nan=1.0), 0.0, 1.0), 0.0)
+    return PruneResult(scores=scores.astype(np.float32), inlier_mask=keep, decided_by=name)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideFilter:
+    """Keep matches by what the matcher knows: ratio test, mutual check, both or neither.
+
+    Attributes
+    ----------
+    max_ratio : float or None
+        Largest ratio kept; no ratio test if None.
+    mutual : bool
+        Keep mutual nearest neighbours only.
+    """
+
+    max_ratio: float | None = None
+    mutual: bool = False
+
+    @property
+    def name(self) -> str:
+        parts = [] if self.max_ratio is None else [f"ratio{self.max_ratio:g}"]
+        return "+".join(parts + ["mutual"] * self.mutual) or "nn"
+
+    @property
+    def fingerprint(self) -> str:
+        return self.name
+
+    def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
+        results = []
+        for pair in pairs:
+            keep = np.ones(len(pair), bool) if self.max_ratio is None else pair.ratios <= self.max_ratio
+            results.append(_result(pair, keep & pair.mutual if self.mutual else keep, self.name))
+        return results
+
+
+@dataclass(frozen=True, kw_only=True)
+class OracleFilter:
+    """Keep exactly the right matches: what a perfect filter would leave, the ceiling of all others."""
+
+    threshold: float = 1e-4
+    name: str = "oracle"
+
+    @property
+    def fingerprint(self) -> str:
+        return f"{self.name} {self.threshold}"
+
+    def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
+        return [_result(pair, pair.inliers(self.threshold), self.name) for pair in pairs]
+
+
+class PrunerFilter:
+    """A method of `corrsfm prune`, with its checkpoint and operating point.
+
+    Parameters
+    ----------
+    name : str
+    config : PruneConfig
+    device : str
+    seed : int
+    threads : int
+    """
+
+    def __init__(self, name: str, config: PruneConfig, *, device: str, seed: int, threads: int) -> None:
+        from corrsfm.prune import build_pruner
+
+        self.name = name
+        self._prune = build_pruner(config, device=device, seed=seed, threads=threads)
+        self.fingerprint = self._prune.fingerprint
+
+    def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
+        return self._prune([pair.as_correspondences() for pair in pairs])
+
+
+_SIDE = re.compile(r"(?:nn|mutual|ratio(?P<ratio>0?\.\d+|1(?:\.0)?)(?P<mutual>\+mutual)?)")
+_PRUNER = re.compile(r"(?P<method>[a-z]+)(?:@(?P<point>[a-z]+))?(?::(?P<model>.+))?")
+
+
+def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> PairFilter:
+    """A filter from its name.
+
+    Parameters
+    ----------
+    text : str
+        ``nn`` (all matches), ``mutual``, ``ratio0.8``, ``ratio0.8+mutual`` (any ratio), ``gms``, ``adalam``,
+        ``oracle`` (the right matches), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
+    device, seed, threads
+        For methods of `corrsfm prune`.
+
+    Raises
+    ------
+    ConfigError
+        If the name means nothing.
+    DependencyError
+        If the library that brings the filter is not installed.
+    """
+    if text == "oracle":
+        return OracleFilter()
+    if text in ("gms", "adalam"):
+        # Here, not above: their libraries are optional.
+        from corrsfm.evaluation.two_view.neighbourhood import AdalamFilter, GmsFilter
+
+        return GmsFilter() if text == "gms" else AdalamFilter(seed=seed)
+    if side := _SIDE.fullmatch(text):
+        ratio = float(side["ratio"]) if side["ratio"] else None
+        return SideFilter(max_ratio=ratio, mutual=text.endswith("mutual"))
+    methods = [str(method) for method in PruneMethod]
+    if not (match := _PRUNER.fullmatch(text)) or match["method"] not in methods:
+        raise ConfigError(
+            f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, gms, "
+            f"adalam, oracle, or METHOD[@POINT][:CHECKPOINT] with METHOD of {', '.join(methods)}"
+        )
+    config = parse_prune_method(text, PruneConfig())
+    return PrunerFilter(text, config, device=device, seed=seed, threads=threads)
+
+
+def parse_prune_method(text: str, base: PruneConfig) -> PruneConfig:
+    """Options of a method of `corrsfm prune` from ``METHOD[@POINT][:CHECKPOINT]``.
+
+    Parameters
+    ----------
+    text : str
+    base : PruneConfig
+        What the text does not say.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such method or operating point.
+    """
+    match = _PRUNER.fullmatch(text)
+    methods, points = [str(m) for m in PruneMethod], [str(p) for p in OperatingPoint]
+    if not match or match["method"] not in methods or match["point"] not in (None, *points):
+        raise ConfigError(
+            f"no prune method '{text}'; expected METHOD[@POINT][:CHECKPOINT] with METHOD of "
+            f"{', '.join(methods)} and POINT of {', '.join(points)}"
+        )
+    return dataclasses.replace(
+        base,
+        method=PruneMethod(match["method"]),
+        operating_point=OperatingPoint(match["point"]) if match["point"] else base.operating_point,
+        model=Path(match["model"]) if match["model"] else base.model,
+    )

@@ -1,0 +1,1 @@
+"""SIFT features of photos."""

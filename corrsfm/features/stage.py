@@ -1,0 +1,107 @@
+"""The second stage: photos become features."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+
+from corrsfm import config as cfg
+from corrsfm.colmap.log import colmap_log
+from corrsfm.config import config_hash
+from corrsfm.errors import ImageError
+from corrsfm.features.sift import algorithm_of, create_extractor
+from corrsfm.images.photos import read_image, read_mask
+from corrsfm.machine import count_threads, threaded
+from corrsfm.types import Features, ImageRecord
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.lists import Index, read_index
+from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
+from corrsfm.workspace.store import ItemStore
+
+__all__ = ["extract_features"]
+
+logger = logging.getLogger("corrsfm")
+
+
+def extract_features(
+    workspace: Workspace, config: cfg.FeaturesConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Extract the features of every photo of the index.
+
+    Raises
+    ------
+    ImageError
+        Naming every photo that cannot be read; the features of the others are kept.
+    """
+    index = read_index(workspace)
+    images = workspace.require("images")
+    algorithm = algorithm_of(config.extractor)
+    wanted = {
+        record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
+        for record in index.records
+    }
+    of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
+    store = ItemStore(workspace.features, FEATURES)
+    records = {record.name: record for record in index.records}
+    extract = create_extractor(config)
+    mask_dir = images.config.get("mask_dir")
+    unreadable: list[str] = []
+
+    def work(name: str) -> Features | ImageError:
+        record = records[name]
+        try:
+            image = read_image(workspace.images_dir / name)
+            mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
+            return extract(image, mask)
+        except ImageError as error:
+            return error
+
+    def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
+        for name, result in threaded(work, missing, count_threads(run.threads)):
+            if isinstance(result, Features):
+                yield name, result
+            elif images.config.get("skip_unreadable"):
+                logger.warning("left out: %s", result)
+                wanted[name] = of_left_out[name]
+                yield name, _no_features(index, records[name])
+            else:
+                unreadable.append(str(result))
+        if unreadable:
+            raise ImageError(
+                "\n".join(unreadable)
+                + "\nremove or replace these photos and run again, or use --skip-unreadable; the features of "
+                "the others are kept"
+            )
+
+    with colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext():
+        if images.config.get("skip_unreadable"):
+            for name in sorted(store.finished(of_left_out)):
+                if isinstance(result := work(name), ImageError):
+                    logger.warning("left out: %s", result)
+                    wanted[name] = of_left_out[name]
+        return complete(
+            workspace,
+            "features",
+            store,
+            wanted,
+            produce,
+            config,
+            inputs={"images": images.fingerprint},
+            overwrite=overwrite,
+            unit="photo",
+        )
+
+
+def _no_features(index: Index, record: ImageRecord) -> Features:
+    """Features of a photo that was left out."""
+    camera = index.camera_of(record)
+    none = np.zeros(0, np.float32)
+    return Features(
+        keypoints=np.zeros((0, 2), np.float32), scales=none, orientations=none, scores=none,
+        descriptors=np.zeros((0, 128), np.uint8), image_size=(camera.width, camera.height),
+    )  # fmt: skip

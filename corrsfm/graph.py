@@ -1,0 +1,47 @@
+"""Which photos pairs connect."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+
+from corrsfm.errors import first_few
+from corrsfm.types import Pair
+
+__all__ = ["MAX_NAMED_GROUPS", "connected_components", "describe_components"]
+
+
+MAX_NAMED_GROUPS = 5
+
+
+def connected_components(names: Sequence[str], pairs: Iterable[Pair]) -> list[list[str]]:
+    """Groups of photos connected by pairs, the largest first, each sorted; single photos included."""
+    parent = {name: name for name in names}
+
+    def root(name: str) -> str:
+        while parent[name] != name:
+            parent[name] = parent[parent[name]]
+            name = parent[name]
+        return name
+
+    for name0, name1 in pairs:
+        parent[root(name0)] = root(name1)
+    groups = defaultdict(list)
+    for name in sorted(names):
+        groups[root(name)].append(name)
+    return sorted(groups.values(), key=lambda group: (-len(group), group))
+
+
+def describe_components(names: Sequence[str], pairs: Iterable[Pair]) -> str:
+    """What is wrong if the pairs do not connect all photos; empty if they do."""
+    components = connected_components(names, pairs)
+    if len(components) < 2:
+        return ""
+    sizes = first_few(str(len(group)) for group in components)
+    lines = [
+        f"the pairs do not connect all photos: groups of {sizes} photos, which cannot become one model;"
+        " a wider --pairing, or several combined, may connect them"
+    ]
+    for group in components[1 : 1 + MAX_NAMED_GROUPS]:
+        lines.append(f"not connected to the largest group: {first_few(group)}")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""Photos: their list, cameras, positions and pixels."""

@@ -1,0 +1,65 @@
+"""What photos said of themselves when they were last read, so that they are not read again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from corrsfm.files import atomic_write_json, sha256_of
+from corrsfm.images.cameras import PhotoInfo
+from corrsfm.images.photos import read_photo_info
+
+__all__ = ["PhotoCache"]
+
+
+class PhotoCache:
+    """Hashes and headers of photos, remembered as long as the file stays the same.
+
+    The same means its size, the times of its content and of its entry, and its number in the file system: a
+    copy over it or a swap may keep the first two.
+
+    Reading them decodes every photo, which a resumed run of thousands of photos should not do again.
+
+    Parameters
+    ----------
+    path : Path
+        The file that remembers; a missing or damaged one remembers nothing.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._kept: dict[str, dict[str, Any]] = {}
+        try:
+            self._known = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, ValueError, TypeError):
+            self._known = {}
+
+    def hash_of(self, path: Path) -> str:
+        """As `corrsfm.files.sha256_of`."""
+        return self._value(path, "sha256", sha256_of)
+
+    def info_of(self, path: Path) -> PhotoInfo:
+        """As `corrsfm.images.read_photo_info`."""
+        values = self._value(path, "info", lambda photo: dataclasses.asdict(read_photo_info(photo)))
+        # JSON has no tuples.
+        return PhotoInfo(**{**values, "gps": tuple(values["gps"]) if values["gps"] else None})
+
+    def _value(self, path: Path, key: str, compute: Callable[[Path], Any]) -> Any:
+        try:
+            stat = path.stat()
+        except OSError:  # a broken link; what reads it says so
+            return compute(path)
+        name = str(path.resolve())
+        stamp = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
+        known = self._known.get(name)
+        entry = self._kept.setdefault(name, known if known and known["stamp"] == stamp else {"stamp": stamp})
+        if key not in entry:
+            entry[key] = compute(path)
+        return entry[key]
+
+    def save(self) -> None:
+        """Remember the photos that were asked for since construction, and no others."""
+        atomic_write_json(self._path, self._kept)

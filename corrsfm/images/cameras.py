@@ -1,0 +1,201 @@
+"""Cameras: which photos share one, what is known about each, and points normalised by it."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from corrsfm.colmap.cameras import camera_from_pycolmap
+from corrsfm.config import CameraMode
+from corrsfm.errors import ConfigError, InputError, first_few
+from corrsfm.types import Camera
+
+if TYPE_CHECKING:
+    pass
+
+__all__ = ["PhotoInfo", "assign_cameras"]
+
+# COLMAP's guess where nothing is known: a field of view of about 45° along the longest side.
+DEFAULT_FOCAL_FACTOR = 1.2
+# EXIF rounds focal lengths by a few per cent; photos of one camera that differ by more were zoomed.
+SAME_FOCAL_RATIO = 1.05
+
+logger = logging.getLogger("corrsfm")
+
+
+@dataclass(frozen=True, kw_only=True)
+class PhotoInfo:
+    """What a photo says about its camera.
+
+    Attributes
+    ----------
+    width, height : int
+        Pixels as stored.
+    camera_name : str or None
+        Make, model and focal length setting from EXIF.
+    focal_px : float or None
+        Focal length in pixels from EXIF.
+    gps : tuple of float or None
+        Latitude and longitude in degrees, altitude in metres; 0 if the altitude is not known.
+    """
+
+    width: int
+    height: int
+    camera_name: str | None = None
+    focal_px: float | None = None
+    gps: tuple[float, float, float] | None = None
+
+
+def assign_cameras(
+    names: Sequence[str], infos: Sequence[PhotoInfo], *, mode: CameraMode, model: str, params: str = ""
+) -> tuple[list[Camera], list[int]]:
+    """Decide which photos share a camera, and what is known about each camera.
+
+    Parameters
+    ----------
+    names : sequence of str
+    infos : sequence of PhotoInfo
+        One per name.
+    mode : CameraMode
+        ``auto`` shares a camera among photos of equal size, EXIF camera and focal length. Photos without EXIF
+        get one each, as in COLMAP: equal size is no proof, and a wrongly shared camera ruins a model.
+        A camera that photos share by any other mode starts from the median of their known focal lengths; a
+        warning names its photos if these differ by more than a few per cent.
+    model : str
+        COLMAP camera model.
+    params : str
+        Known intrinsics, comma-separated in COLMAP's order; empty to take the focal length from EXIF or,
+        failing that, to guess it.
+
+    Returns
+    -------
+    cameras : list of Camera
+        In the order of the first photo of each.
+    camera_ids : list of int
+        Index into the cameras, one per name.
+
+    Raises
+    ------
+    ConfigError
+        If the model is unknown or does not have that many parameters.
+    InputError
+        If photos of one camera differ in size.
+    """
+    values = _parse_params(model, params)
+    keys = [_camera_key(name, info, mode) for name, info in zip(names, infos, strict=True)]
+    groups: dict[tuple, list[int]] = defaultdict(list)
+    for index, key in enumerate(keys):
+        groups[key].append(index)
+        info, reference = infos[index], infos[groups[key][0]]
+        if (info.width, info.height) != (reference.width, reference.height):
+            raise InputError(
+                f"{names[index]}: has {info.width}×{info.height} pixels, but '{names[groups[key][0]]}', which"
+                f" is to share its camera, has {reference.width}×{reference.height}; try --camera-mode auto"
+                " or remove one"
+            )
+    if values:
+        _check_one_size(names, infos)
+    else:
+        for group in groups.values():
+            _warn_of_zoom([(names[index], infos[index].focal_px) for index in group])
+        if mode is CameraMode.AUTO:
+            _suggest_sharing(infos)
+    cameras = [_make_camera([infos[index] for index in group], model, values) for group in groups.values()]
+    position = {key: index for index, key in enumerate(groups)}
+    return cameras, [position[key] for key in keys]
+
+
+def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
+    """Equal for photos that share a camera."""
+    match mode:
+        case CameraMode.SINGLE:
+            return ()
+        case CameraMode.PER_FOLDER:
+            return (PurePosixPath(name).parent.as_posix(),)
+        case CameraMode.AUTO if _has_exif(info):
+            return (info.width, info.height, info.camera_name, info.focal_px)
+    return (name,)
+
+
+def _has_exif(info: PhotoInfo) -> bool:
+    return info.camera_name is not None or info.focal_px is not None
+
+
+def _suggest_sharing(infos: Sequence[PhotoInfo]) -> None:
+    """Say so if photos get a camera each that may well be of one camera."""
+    sizes = Counter((info.width, info.height) for info in infos if not _has_exif(info))
+    num = sum(count for count in sizes.values() if count > 1)
+    if not num:
+        return
+    of_one_size = len({(info.width, info.height) for info in infos}) == 1
+    logger.info(
+        "%d photos of equal size tell no focal length and get a camera each; %s",
+        num,
+        "if one camera took them all, use --camera-mode single"
+        if of_one_size
+        else "put those of one camera in a folder of their own and use --camera-mode per-folder",
+    )
+
+
+def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:
+    """Say so if photos that share a camera, given as names and focal lengths, were taken at several."""
+    known = sorted((focal, name) for name, focal in focals if focal is not None)
+    if known and known[-1][0] > SAME_FOCAL_RATIO * known[0][0]:
+        logger.warning(
+            "%d photos share a camera (%s), but their focal lengths in EXIF run from %.0f px ('%s') to"
+            " %.0f px ('%s'), as if zoomed; --camera-mode auto gives each focal length a camera",
+            len(focals),
+            first_few(name for name, _ in focals),
+            *known[0],
+            *known[-1],
+        )
+
+
+def _make_camera(infos: Sequence[PhotoInfo], model: str, values: list[float]) -> Camera:
+    """The camera of some photos of one size."""
+    import pycolmap
+
+    width, height = infos[0].width, infos[0].height
+    known = [info.focal_px for info in infos if info.focal_px is not None]
+    focal = float(np.median(known)) if known else DEFAULT_FOCAL_FACTOR * max(width, height)
+    camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
+    if values:
+        camera.params = values
+    camera.has_prior_focal_length = bool(values) or bool(known)
+    return camera_from_pycolmap(camera)
+
+
+def _parse_params(model: str, params: str) -> list[float]:
+    """The known intrinsics as numbers; checks the model on the way."""
+    import pycolmap
+
+    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if model not in known:
+        raise ConfigError(f"camera_model is '{model}', expected one of {', '.join(known)}")
+    if not params.strip():
+        return []
+    expected = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params_info
+    try:
+        values = [float(value) for value in params.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != len(expected.split(",")) or not np.isfinite(values).all():
+        raise ConfigError(f"camera_params is '{params}', expected the numbers {expected} for {model}")
+    return values
+
+
+def _check_one_size(names: Sequence[str], infos: Sequence[PhotoInfo]) -> None:
+    sizes = Counter((info.width, info.height) for info in infos)
+    (width, height), _ = sizes.most_common(1)[0]
+    others = [n for n, i in zip(names, infos, strict=True) if (i.width, i.height) != (width, height)]
+    if others:
+        raise InputError(
+            f"known camera_params fit photos of one size, but beside {width}×{height} pixels there are"
+            f" {len(others)} of other sizes, such as '{others[0]}'; leave these out or drop camera_params"
+        )

@@ -1,0 +1,131 @@
+"""Photos: their index, pixels and masks, cameras and positions from EXIF.
+
+Photos are read as stored: an EXIF orientation is not applied, because COLMAP does not either and camera,
+mask and keypoints must speak of the same frame.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.errors import ImageError
+from corrsfm.images.cameras import PhotoInfo
+
+__all__ = ["read_image", "read_mask", "read_photo_info"]
+
+logger = logging.getLogger("corrsfm")
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Read a photo as grey values, in the orientation in which it is stored.
+
+    Any depth, palette, colour or alpha is accepted; alpha is dropped. Depths above 8 bits are scaled by the
+    smallest power of two that holds the photo's brightest pixel, since 10- to 14-bit sensor values are
+    commonly stored in 16 bits.
+
+    Returns
+    -------
+    (H, W) uint8
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read or decoded completely.
+    """
+    image = _decode(path, "re-export or remove the photo")
+    if image.dtype == np.uint16:
+        shift = max(0, int(image.max()).bit_length() - 8)
+        image = (image >> shift).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise ImageError(f"{path}: pixels of type {image.dtype}; convert the photo to 8 or 16 bits")
+    return image
+
+
+def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Read a mask.
+
+    Parameters
+    ----------
+    path : Path
+    shape : tuple of int
+        Height and width of the photo.
+
+    Returns
+    -------
+    (H, W) bool
+        False where the photo is to be ignored (the mask is zero).
+
+    Raises
+    ------
+    ImageError
+        If the mask cannot be read or is not as large as the photo.
+    """
+    mask = _decode(path, "re-export or remove the mask")
+    if mask.shape != tuple(shape[:2]):
+        raise ImageError(
+            f"{path}: the mask has {mask.shape[1]}×{mask.shape[0]} pixels, its photo {shape[1]}×{shape[0]} as"
+            " stored (EXIF orientation not applied); re-export the mask in that size"
+        )
+    return mask > 0
+
+
+def _decode(path: Path, advice: str) -> NDArray:
+    """(H, W) grey values in the depth of the file; reads bytes first, for names of any alphabet."""
+    try:
+        content = np.fromfile(path, np.uint8)
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
+    if len(content) == 0:
+        raise ImageError(f"{path}: the file is empty; {advice}")
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(content, flags)
+    except cv2.error as error:
+        raise ImageError(f"{path}: cannot be decoded ({error.err}); {advice}") from error
+    if image is None:
+        raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}")
+    return np.asarray(image)
+
+
+def read_photo_info(path: Path) -> PhotoInfo:
+    """Size, camera and position of a photo.
+
+    Raises
+    ------
+    ImageError
+        If the photo cannot be read.
+    """
+    import pycolmap
+
+    bitmap = pycolmap.Bitmap.read(path, False)
+    if bitmap is None:
+        # A format that pycolmap does not know (WebP) or a file that cannot be read at all.
+        height, width = read_image(path).shape
+        return PhotoInfo(width=width, height=height)
+    return PhotoInfo(
+        width=int(bitmap.width),
+        height=int(bitmap.height),
+        camera_name=bitmap.exif_camera_model() or None,
+        focal_px=bitmap.exif_focal_length() or None,
+        gps=_position(bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()),
+    )
+
+
+def _position(
+    latitude: float | None, longitude: float | None, altitude: float | None
+) -> tuple[float, float, float] | None:
+    """The position in EXIF if it is one on earth; an altitude that is none becomes 0."""
+    # Receivers without a fix write 0, or 0/0, which is read as NaN.
+    if latitude is None or longitude is None or (latitude, longitude) == (0.0, 0.0):
+        return None
+    # Comparisons with NaN are false.
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+        return None
+    metres = float(altitude or 0.0)
+    return float(latitude), float(longitude), metres if math.isfinite(metres) else 0.0

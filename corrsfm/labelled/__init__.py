@@ -1,0 +1,1 @@
+"""Pairs of photos with known truth, as training and evaluation read them."""

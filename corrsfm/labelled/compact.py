@@ -1,0 +1,284 @@
+"""A compact file of labelled pairs: keypoints once per photo, two bytes and a bit per match.
+
+Tens of thousands of pairs fit in tens of MB, because a pair stores only the nearest neighbour of every
+keypoint, the ratio and the mutual flag; everything else is derived from the photo. One HDF5 group per scene:
+
+==================  ==================  ================================================================
+dataset             shape, dtype        content
+==================  ==================  ================================================================
+image_names         (I,) str            posix paths relative to the scene's image folder
+camera_models       (I,) str            COLMAP camera model
+camera_params       (I, 12) float64     its parameters, padded with NaN
+image_sizes         (I, 2) int32        width, height in pixels
+rotations           (I, 3, 3) float64   cam_from_world
+translations        (I, 3) float64      cam_from_world
+keypoint_offsets    (I+1,) int64        rows of each photo in the next four
+keypoints           (K, 2) uint16       pixels (COLMAP convention) in units of the longest side / 65535
+corrections         (K, 2) float16      undistorted minus pinhole normalised coordinates
+log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels
+orientations        (K,) uint16         orientation in units of a turn / 65536
+pairs               (P, 2) uint16       photo indices
+covisible           (P,) int32          shared points of the reconstruction
+match_offsets       (P+1,) int64        rows of each pair in the next two
+neighbours          (M,) uint16         for each keypoint of image 0 its nearest in image 1; 65535 for none
+ratios              (M,) uint8          ratio of the two nearest descriptor distances in units of 1/255
+mutual              (⌈M/8⌉,) uint8      mutual flags, packed bits
+==================  ==================  ================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.errors import InputError
+from corrsfm.files import atomic_path
+from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
+from corrsfm.labelled.oanet import OANetPair, open_pairs, pinhole_parameters, select_per_scene
+from corrsfm.types import Camera
+
+__all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
+
+NO_NEIGHBOUR = 65535
+_FORMAT, _VERSION = "corrsfm-pairs", 1
+_NUM_PARAMS = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompactScene:
+    """The labelled pairs of one scene, with the quantised values decoded.
+
+    I photos, K keypoints, P pairs, M matches.
+
+    Attributes
+    ----------
+    name : str
+    image_names : tuple of str
+    cameras : tuple of Camera
+        With the full distortion model of the reconstruction.
+    rotations : (I, 3, 3) float64
+    translations : (I, 3) float64
+        cam_from_world, in the units of the scene.
+    keypoint_offsets : (I+1,) int64
+    keypoints : (K, 2) float32
+        Pixels, COLMAP convention.
+    corrections : (K, 2) float32
+        Undistorted minus pinhole normalised coordinates.
+    log_scales : (K,) float32
+    orientations : (K,) float32
+        Radians in [-π, π).
+    pairs : (P, 2) int64
+    covisible : (P,) int64
+    match_offsets : (P+1,) int64
+    neighbours : (M,) uint16
+    ratios : (M,) float32
+    mutual : (M,) bool
+    """
+
+    name: str
+    image_names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    rotations: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    keypoint_offsets: NDArray[np.int64]
+    keypoints: NDArray[np.float32]
+    corrections: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    orientations: NDArray[np.float32]
+    pairs: NDArray[np.int64]
+    covisible: NDArray[np.int64]
+    match_offsets: NDArray[np.int64]
+    neighbours: NDArray[np.uint16]
+    ratios: NDArray[np.float32]
+    mutual: NDArray[np.bool_]
+
+    def normalised(self, image: int, *, undistorted: bool) -> NDArray[np.float64]:
+        """Normalised keypoints (N, 2) of one photo, by the pinhole part of its camera or the full model."""
+        rows = slice(*self.keypoint_offsets[image : image + 2])
+        fx, fy, cx, cy = pinhole_parameters(self.cameras[image])
+        points = (self.keypoints[rows] - np.array([cx, cy])) / np.array([fx, fy])
+        return points + self.corrections[rows] if undistorted else points
+
+    def matched(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keypoint indices of the matches of a pair, within photo 0 and photo 1."""
+        neighbours = self.neighbours[slice(*self.match_offsets[index : index + 2])]
+        found = np.flatnonzero(neighbours != NO_NEIGHBOUR)
+        return found, neighbours[found].astype(np.int64)
+
+    def pair(self, index: int) -> OANetPair:
+        """One pair with its label distances.
+
+        The correspondences are normalised by the pinhole part of the cameras, as a user would know them; the
+        distances to the true epipolar lines use the full model.
+        """
+        image0, image1 = (int(image) for image in self.pairs[index])
+        index0, index1 = self.matched(index)
+        rows = self.match_offsets[index] + index0
+        rotation, translation = relative_pose(
+            self.rotations[image0],
+            self.translations[image0],
+            self.rotations[image1],
+            self.translations[image1],
+        )
+        true, known = (
+            np.hstack(
+                [
+                    self.normalised(image0, undistorted=undistorted)[index0],
+                    self.normalised(image1, undistorted=undistorted)[index1],
+                ]
+            )
+            for undistorted in (True, False)
+        )
+        key0, key1 = self.keypoint_offsets[image0] + index0, self.keypoint_offsets[image1] + index1
+        turn = self.orientations[key1] - self.orientations[key0]
+        return OANetPair(
+            correspondences=known.astype(np.float32),
+            label_distances=symmetric_epipolar_distance_sq(
+                essential_from_pose(rotation, translation), true
+            ).astype(np.float32),
+            rotation=rotation,
+            translation=translation / max(float(np.linalg.norm(translation)), 1e-12),
+            ratios=self.ratios[rows],
+            mutual=self.mutual[rows],
+            camera0=self.cameras[image0],
+            camera1=self.cameras[image1],
+            scene=self.name,
+            log_scale_ratios=self.log_scales[key1] - self.log_scales[key0],
+            rotations=wrap_angles(turn),
+        )
+
+
+def _encode(scene: CompactScene) -> dict[str, NDArray]:
+    """Datasets of a scene as they are stored."""
+    sizes = np.array([(camera.width, camera.height) for camera in scene.cameras], np.int32).reshape(-1, 2)
+    params = np.full((len(scene.cameras), _NUM_PARAMS), np.nan)
+    for row, camera in zip(params, scene.cameras, strict=True):
+        row[: len(camera.params)] = camera.params
+    longest = np.repeat(sizes.max(axis=1, initial=1), np.diff(scene.keypoint_offsets))
+    turns = np.round(scene.orientations / (2.0 * np.pi) * 65536.0).astype(np.int64)
+    return {
+        "image_sizes": sizes,
+        "camera_params": params,
+        "rotations": scene.rotations,
+        "translations": scene.translations,
+        "keypoint_offsets": scene.keypoint_offsets,
+        "keypoints": np.round(np.clip(scene.keypoints / longest[:, None], 0, 1) * 65535.0).astype(np.uint16),
+        "corrections": scene.corrections.astype(np.float16),
+        "log_scales": scene.log_scales.astype(np.float16),
+        "orientations": (turns % 65536).astype(np.uint16),
+        "pairs": scene.pairs.astype(np.uint16),
+        "covisible": scene.covisible.astype(np.int32),
+        "match_offsets": scene.match_offsets,
+        "neighbours": scene.neighbours,
+        "ratios": np.round(np.clip(scene.ratios, 0, 1) * 255.0).astype(np.uint8),
+        "mutual": np.packbits(scene.mutual),
+    }
+
+
+def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
+    """Write scenes to one file, whole or not at all.
+
+    Returns
+    -------
+    int
+        The number of pairs written.
+    """
+    num_pairs = 0
+    with atomic_path(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"], file.attrs["version"] = _FORMAT, _VERSION
+        for scene in scenes:
+            group = file.create_group(scene.name)
+            group["image_names"] = np.array(scene.image_names, dtype=h5py.string_dtype())
+            models = [camera.model for camera in scene.cameras]
+            group["camera_models"] = np.array(models, dtype=h5py.string_dtype())
+            for name, values in _encode(scene).items():
+                compress = {"compression": "gzip", "shuffle": True} if values.size > 64 else {}
+                group.create_dataset(name, data=values, **compress)
+            num_pairs += len(scene.pairs)
+    return num_pairs
+
+
+def _decode(name: str, group: h5py.Group) -> CompactScene:
+    stored = {key: group[key][()] for key in group if key not in ("image_names", "camera_models")}
+    sizes, offsets = stored["image_sizes"], stored["keypoint_offsets"]
+    cameras = tuple(
+        Camera(
+            model=model,
+            width=int(size[0]),
+            height=int(size[1]),
+            params=tuple(float(value) for value in params[~np.isnan(params)]),
+            has_prior_focal_length=True,
+        )
+        for model, size, params in zip(
+            group["camera_models"].asstr()[()], sizes, stored["camera_params"], strict=True
+        )
+    )
+    longest = np.repeat(sizes.max(axis=1, initial=1), np.diff(offsets))
+    num_matches = len(stored["neighbours"])
+    return CompactScene(
+        name=name,
+        image_names=tuple(group["image_names"].asstr()[()]),
+        cameras=cameras,
+        rotations=stored["rotations"],
+        translations=stored["translations"],
+        keypoint_offsets=offsets,
+        keypoints=(stored["keypoints"] * (longest[:, None] / 65535.0)).astype(np.float32),
+        corrections=stored["corrections"].astype(np.float32),
+        log_scales=stored["log_scales"].astype(np.float32),
+        # The cast to a signed integer puts the angle in [-π, π).
+        orientations=(stored["orientations"].astype(np.int16) * (2.0 * np.pi / 65536.0)).astype(np.float32),
+        pairs=stored["pairs"].astype(np.int64),
+        covisible=stored["covisible"].astype(np.int64),
+        match_offsets=stored["match_offsets"],
+        neighbours=stored["neighbours"],
+        ratios=(stored["ratios"] / 255.0).astype(np.float32),
+        mutual=np.unpackbits(stored["mutual"], count=num_matches).astype(bool),
+    )
+
+
+def is_compact(path: Path) -> bool:
+    """Whether a file is a compact pair file of any version, rather than one in another HDF5 layout."""
+    with open_pairs(path) as file:
+        return bool(file.attrs.get("format") == _FORMAT)
+
+
+def read_scenes(path: Path) -> list[CompactScene]:
+    """Read all scenes of a file, sorted by name.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or of another format.
+    """
+    with open_pairs(path) as file:
+        if file.attrs.get("format") != _FORMAT or file.attrs.get("version") != _VERSION:
+            raise InputError(
+                f"{path}: not a compact pair file of version {_VERSION}; make one with: corrsfm train prepare"
+            )
+        return [_decode(name, file[name]) for name in sorted(file)]
+
+
+def read_labelled_pairs(
+    path: Path, *, num_per_scene: int | None = None, seed: int = 0
+) -> Iterator[OANetPair]:
+    """Pairs of a compact file in the record of the OANet layout.
+
+    Parameters
+    ----------
+    path : Path
+    num_per_scene : int, optional
+        Draw at most so many pairs of each scene at random; all if not given.
+    seed : int
+        Seed of the draw.
+    """
+    for scene in read_scenes(path):
+        indices: Iterable[int] = range(len(scene.pairs))
+        if num_per_scene is not None:
+            indices = select_per_scene([scene.name] * len(scene.pairs), num_per_scene, seed)
+        for index in indices:
+            yield scene.pair(index)

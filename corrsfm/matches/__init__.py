@@ -1,0 +1,1 @@
+"""Putative matches: nearest neighbours of descriptors."""

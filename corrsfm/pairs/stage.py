@@ -1,0 +1,90 @@
+"""The third stage: features become the list of pairs to match."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+
+from corrsfm import config as cfg
+from corrsfm.config import config_hash
+from corrsfm.errors import InputError
+from corrsfm.files import sha256_of
+from corrsfm.graph import describe_components
+from corrsfm.pairs import strategies
+from corrsfm.types import PairList
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
+from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
+from corrsfm.workspace.store import ItemStore
+
+__all__ = ["make_pairs"]
+
+logger = logging.getLogger("corrsfm")
+
+
+def make_pairs(
+    workspace: Workspace, config: cfg.PairsConfig, run: cfg.RunConfig, *, overwrite: bool = False
+) -> StageOutcome:
+    """Choose the pairs to match, and warn if they do not connect all photos.
+
+    Photos that were left out as unreadable have no pairs.
+    """
+    started = time.monotonic()
+    index = read_index(workspace)
+    features = workspace.require("features")
+    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
+    fingerprint = config_hash(
+        "pairs", config, run.seed, [[r.name, r.gps] for r in index.records], features.fingerprint, *files
+    )
+    left_out = photos_left_out(workspace, index.names)
+    records = [record for record in index.records if record.name not in left_out]
+    if len(records) < 2:
+        raise InputError(
+            f"{workspace.root}: {len(left_out)} of {len(index.records)} photos cannot be read, at least 2 "
+            "are needed; replace them and run again"
+        )
+    names = [record.name for record in records]
+    if not overwrite and workspace.is_current("pairs", fingerprint, workspace.pairs, workspace.pair_origins):
+        pair_list = read_pairs(workspace)
+        _warn_if_disconnected(names, pair_list)
+        return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
+    explain(workspace, "pairs", config)
+    with ItemStore(workspace.features, FEATURES).reader() as read:
+        # A list or a model may well name photos that were left out; that is no mistake.
+        candidates = index.records if files else records
+        pair_list = _without(
+            left_out, strategies.make_pairs(candidates, config, load_features=read, seed=run.seed)
+        )
+    if not len(pair_list):
+        raise InputError(
+            f"{workspace.root}: no pair of photos to match; choose another --pairing or larger neighbourhoods"
+        )
+    _warn_if_disconnected(names, pair_list)
+    workspace.forget("pairs")
+    write_pairs(workspace, pair_list)
+    outcome = StageOutcome(stage="pairs", num_items=len(pair_list), seconds=time.monotonic() - started)
+    finish(workspace, outcome, fingerprint, config, inputs={"features": features.fingerprint})
+    return outcome
+
+
+def _without(names: set[str], pair_list: PairList) -> PairList:
+    """The pairs of a list that are of other photos than these."""
+    kept = [number for number, pair in enumerate(pair_list.pairs) if names.isdisjoint(pair)]
+    return PairList(
+        pairs=tuple(pair_list.pairs[number] for number in kept),
+        origins=tuple(pair_list.origins[number] for number in kept),
+    )
+
+
+def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
+    text = describe_components(names, pair_list.pairs)
+    if text:
+        logger.warning("%s", text)
+
+
+def _content(path: Path) -> str:
+    """Hash of what a file or all files of a folder hold; missing ones are reported by whoever reads them."""
+    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    return config_hash(*[[file.name, sha256_of(file)] for file in files if file.is_file()])

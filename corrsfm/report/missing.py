@@ -1,0 +1,132 @@
+"""Why photos are missing from the first model of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from corrsfm.types import ModelSummary, PairStatistics
+
+__all__ = ["MissingImage", "MissingReason", "missing_images"]
+
+
+class MissingReason(StrEnum):
+    """Why a photo is not in the first model: the first step of the pipeline that lost it."""
+
+    LEFT_OUT = "unreadable, left out"
+    NO_PAIR = "no pair"
+    NO_MATCH = "no putative match"
+    PRUNED = "pruned to nothing"
+    NOT_VERIFIED = "too few verified matches"
+    OTHER_MODEL = "in another model"
+    NOT_MAPPED = "not mapped yet"
+    OTHER_COMPONENT = "in another component"
+    NOT_PLACED = "mapper could not place it"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MissingImage:
+    """A photo that is not in the first model.
+
+    Attributes
+    ----------
+    name : str
+    reason : MissingReason
+    detail : str
+        A sentence without its full stop: the numbers behind the reason.
+    """
+
+    name: str
+    reason: MissingReason
+    detail: str
+
+
+def missing_images(
+    names: Sequence[str],
+    pairs: Sequence[PairStatistics],
+    components: Sequence[tuple[str, ...]],
+    models: Sequence[ModelSummary],
+    left_out: Collection[str],
+    mapped: bool,
+) -> tuple[MissingImage, ...]:
+    pairs_of: dict[str, list[PairStatistics]] = {name: [] for name in names}
+    for pair in pairs:
+        pairs_of[pair.name0].append(pair)
+        pairs_of[pair.name1].append(pair)
+    model_of = {
+        name: number for number, model in reversed(list(enumerate(models))) for name in model.image_names
+    }
+    component_of = {name: component for component in components for name in component}
+    main = _main_component(components, models)
+    missing = []
+    for name in names:
+        if model_of.get(name) == 0:
+            continue
+        component = component_of.get(name, ())
+        if name in left_out:
+            reason = MissingReason.LEFT_OUT
+            detail = "replace the file and run again"
+        elif name in model_of:
+            reason = MissingReason.OTHER_MODEL
+            size = models[model_of[name]].num_images
+            connected = (
+                "verified pairs connect them" if component == main else "no verified pairs connect them"
+            )
+            detail = f"one of {size} photos of model {model_of[name]}; {connected} with model 0"
+        elif component and not mapped:
+            reason, detail = MissingReason.NOT_MAPPED, _verified_pairs(name, pairs_of[name])
+        else:
+            reason, detail = _lost_at(name, pairs_of[name], component, main)
+        missing.append(MissingImage(name=name, reason=reason, detail=detail))
+    return tuple(missing)
+
+
+def _main_component(components: Sequence[tuple[str, ...]], models: Sequence[ModelSummary]) -> tuple[str, ...]:
+    """The component that the first model was made from; the largest one if there is no model."""
+    if not components:
+        return ()
+    registered = set(models[0].image_names) if models else set()
+    return max(components, key=lambda component: (len(registered.intersection(component)), len(component)))
+
+
+def _lost_at(
+    name: str, pairs: Sequence[PairStatistics], component: tuple[str, ...], main: tuple[str, ...]
+) -> tuple[MissingReason, str]:
+    """The first step after which nothing of a photo's pairs was left, and the numbers behind it."""
+    if not pairs:
+        return MissingReason.NO_PAIR, "it was not matched with any photo"
+    among = f"{len(pairs)} pair" + ("s" if len(pairs) > 1 else "")
+    if not any(pair.num_putative for pair in pairs):
+        return MissingReason.NO_MATCH, f"no match in {among}; it may have no keypoints"
+    if not any(pair.num_pruned for pair in pairs):
+        return (
+            MissingReason.PRUNED,
+            f"no match kept in {among}; most putative ones: {_best(name, pairs, 'num_putative')}",
+        )
+    if not component:
+        return (
+            MissingReason.NOT_VERIFIED,
+            f"none of {among} verified; most kept: {_best(name, pairs, 'num_pruned')}",
+        )
+    if component != main:
+        others = len(component) - 1
+        return (
+            MissingReason.OTHER_COMPONENT,
+            f"verified pairs connect it with {others} other photo{'s' if others > 1 else ''} only",
+        )
+    return MissingReason.NOT_PLACED, _verified_pairs(name, pairs)
+
+
+def _verified_pairs(name: str, pairs: Sequence[PairStatistics]) -> str:
+    """How many of a photo's pairs are verified, and the best of them."""
+    num_verified = sum(pair.num_verified > 0 for pair in pairs)
+    plural = "s" if num_verified > 1 else ""
+    return f"{num_verified} verified pair{plural}; most matches: {_best(name, pairs, 'num_verified')}"
+
+
+def _best(name: str, pairs: Sequence[PairStatistics], count: str) -> str:
+    """The largest of some count of a photo's pairs, and with which photo."""
+    pair = max(pairs, key=lambda pair: getattr(pair, count))
+    other = pair.name1 if pair.name0 == name else pair.name0
+    return f"{getattr(pair, count)} with {other}"

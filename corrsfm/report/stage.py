@@ -1,0 +1,95 @@
+"""The last stage: what a workspace holds, in `report.json` and on the page `report.html`."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from corrsfm.colmap.models import read_models, summarise_model
+from corrsfm.colmap.pairs import read_verified_pairs
+from corrsfm.files import atomic_write_json
+from corrsfm.machine import versions
+from corrsfm.report.page import write_html
+from corrsfm.report.statistics import SceneReport, make_report
+from corrsfm.types import Pair, PairStatistics
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.commands import STAGE_COMMANDS
+from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
+from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.resume import photos_left_out, require_database
+from corrsfm.workspace.store import ItemStore
+
+__all__ = ["report"]
+
+logger = logging.getLogger("corrsfm")
+
+
+def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
+    """Gather the statistics of a workspace; write `report.json` and, if asked for, `report.html`.
+
+    Works without models too and then tells why there are none. Models of earlier matches are left out.
+    """
+    require_database(workspace)
+    records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}
+    if "models" in records and not workspace.current_record_of("models"):
+        del records["models"]
+        logger.warning("models are older than the matches; run: %s", workspace.command_for("models"))
+    models = read_models(workspace.sparse) if "models" in records else []
+    names = read_index(workspace).names
+    summary = make_report(
+        scene=workspace.root.resolve().name,
+        image_names=names,
+        left_out=photos_left_out(workspace, names),
+        mapped="models" in records or workspace.mapping_failed,
+        pairs=_pair_statistics(workspace),
+        models=[summarise_model(model) for model in models],
+        stage_seconds={stage: record.seconds for stage, record in records.items()},
+        configuration={stage: record.config for stage, record in records.items()},
+        versions=versions(),
+    )
+    atomic_write_json(workspace.report_json, summary.to_dict())
+    if html:
+        write_html(
+            summary,
+            workspace.report_html,
+            model=models[0] if models else None,
+            images_dir=workspace.images_dir,
+            load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
+        )
+    return summary
+
+
+def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:
+    verified = {
+        (pair.name0, pair.name1): pair.num_inliers for pair in read_verified_pairs(workspace.database)
+    }
+    pruned = ItemStore(workspace.pruned, PRUNED)
+    return [
+        PairStatistics(
+            name0=name0,
+            name1=name1,
+            num_putative=int(counts["num_putative"]),
+            num_pruned=_num_kept(pruned, (name0, name1), counts),
+            num_verified=verified.get((min(name0, name1), max(name0, name1)), 0),
+        )
+        for (name0, name1), counts in pruned.attributes(read_pairs(workspace).pairs)
+    ]
+
+
+def _num_kept(store: ItemStore[Pair, PrunedMatches], pair: Pair, counts: dict[str, Any]) -> int:
+    # Files of the first days hold no count.
+    return int(counts["num_kept"]) if "num_kept" in counts else len(store.read(pair).indices)
+
+
+def _points_of_matches(
+    workspace: Workspace, pair: Pair
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Putative matches of a pair as points in both photos, and which of them pruning kept."""
+    with ItemStore(workspace.features, FEATURES).reader() as read_features:
+        keypoints0, keypoints1 = (read_features(name).keypoints for name in pair)
+    indices = ItemStore(workspace.matches, MATCHES).read(pair).indices
+    kept = ItemStore(workspace.pruned, PRUNED).read(pair).indices
+    return keypoints0[indices[:, 0]], keypoints1[indices[:, 1]], np.isin(indices[:, 0], kept[:, 0])

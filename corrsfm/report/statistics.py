@@ -1,0 +1,240 @@
+"""The statistics of a scene, and why photos are missing from its model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from corrsfm.report.missing import MissingImage, MissingReason, missing_images
+from corrsfm.types import ModelSummary, PairStatistics
+
+__all__ = ["SceneReport", "make_report"]
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneReport:
+    """All there is to say about a scene.
+
+    Attributes
+    ----------
+    scene : str
+        What to call it.
+    image_names : tuple of str
+        All photos, sorted.
+    models : tuple of ModelSummary
+        The largest first; "registered" means "in the first model".
+    pairs : tuple of PairStatistics
+        In order of their names.
+    components : tuple of tuple of str
+        Connected components of the graph of verified pairs, the largest first; photos without a verified
+        pair are not part of any.
+    missing : tuple of MissingImage
+        Photos that are not registered, sorted by name.
+    stage_seconds : dict
+        Stage → seconds of wall clock it took when it was last run, in the order of the stages.
+    configuration : dict
+        The options of the run.
+    versions : dict
+        Program → version.
+    """
+
+    scene: str
+    image_names: tuple[str, ...]
+    models: tuple[ModelSummary, ...]
+    pairs: tuple[PairStatistics, ...]
+    components: tuple[tuple[str, ...], ...]
+    missing: tuple[MissingImage, ...]
+    stage_seconds: dict[str, float]
+    configuration: dict[str, Any]
+    versions: dict[str, str]
+
+    @property
+    def num_registered(self) -> int:
+        """Photos in the first model."""
+        return self.models[0].num_images if self.models else 0
+
+    @property
+    def registered_percent(self) -> float:
+        """Share of the photos that are in the first model."""
+        return 100.0 * self.num_registered / max(len(self.image_names), 1)
+
+    @property
+    def num_in_models(self) -> int:
+        """Photos in any of the models."""
+        return len({name for model in self.models for name in model.image_names})
+
+    @property
+    def num_verified_pairs(self) -> int:
+        """Pairs with a verified two-view geometry."""
+        return sum(pair.num_verified > 0 for pair in self.pairs)
+
+    @property
+    def num_empty_pairs(self) -> int:
+        """Pairs pruned to nothing."""
+        return sum(pair.num_pruned == 0 for pair in self.pairs)
+
+    @property
+    def num_matches(self) -> tuple[int, int, int]:
+        """Putative, pruned and verified matches over all pairs."""
+        return (
+            sum(pair.num_putative for pair in self.pairs),
+            sum(pair.num_pruned for pair in self.pairs),
+            sum(pair.num_verified for pair in self.pairs),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON: a ``summary`` to read first, then everything; undefined numbers are null."""
+        putative, pruned, verified = self.num_matches
+        largest = self.models[0] if self.models else None
+        values = {
+            "format_version": FORMAT_VERSION,
+            "summary": {
+                "num_images": len(self.image_names),
+                "num_registered": self.num_registered,
+                "registered_percent": self.registered_percent,
+                "num_in_models": self.num_in_models,
+                "num_models": len(self.models),
+                "model_sizes": [model.num_images for model in self.models],
+                "num_points": largest.num_points if largest else 0,
+                "num_observations": largest.num_observations if largest else 0,
+                "mean_track_length": largest.mean_track_length if largest else None,
+                "mean_observations_per_image": largest.mean_observations_per_image if largest else None,
+                "mean_error_px": largest.mean_error_px if largest else None,
+                "median_error_px": largest.median_error_px if largest else None,
+                "p95_error_px": largest.p95_error_px if largest else None,
+                "num_pairs": len(self.pairs),
+                "num_empty_pairs": self.num_empty_pairs,
+                "num_verified_pairs": self.num_verified_pairs,
+                "num_putative_matches": putative,
+                "num_pruned_matches": pruned,
+                "num_verified_matches": verified,
+                "num_components": len(self.components),
+                "seconds": sum(self.stage_seconds.values()),
+            },
+            **{entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)},
+        }
+        return _plain(values)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> SceneReport:
+        """The report that `to_dict` was called on.
+
+        Raises
+        ------
+        ValueError
+            If the values are of another format version.
+        """
+        if values.get("format_version") != FORMAT_VERSION:
+            raise ValueError(
+                f"report of format {values.get('format_version')}, this version reads {FORMAT_VERSION}"
+            )
+        return cls(
+            scene=values["scene"],
+            image_names=tuple(values["image_names"]),
+            models=tuple(_model_from_dict(model) for model in values["models"]),
+            pairs=tuple(PairStatistics(**pair) for pair in values["pairs"]),
+            components=tuple(tuple(component) for component in values["components"]),
+            missing=tuple(
+                MissingImage(
+                    name=image["name"], reason=MissingReason(image["reason"]), detail=image["detail"]
+                )
+                for image in values["missing"]
+            ),
+            stage_seconds=dict(values["stage_seconds"]),
+            configuration=dict(values["configuration"]),
+            versions=dict(values["versions"]),
+        )
+
+
+def make_report(
+    *,
+    scene: str,
+    image_names: Iterable[str],
+    pairs: Iterable[PairStatistics],
+    models: Sequence[ModelSummary],
+    left_out: Collection[str] = (),
+    mapped: bool = True,
+    stage_seconds: Mapping[str, float] | None = None,
+    configuration: Mapping[str, Any] | None = None,
+    versions: Mapping[str, str] | None = None,
+) -> SceneReport:
+    """Gather the facts about a scene and find out why photos are missing.
+
+    Parameters
+    ----------
+    scene : str
+        What to call it.
+    image_names : iterable of str
+        All photos that went in.
+    pairs : iterable of PairStatistics
+        All pairs that were matched, those pruned to nothing included.
+    models : sequence of ModelSummary
+        The largest first; none if mapping failed.
+    left_out : collection of str, optional
+        Photos that could not be read.
+    mapped : bool
+        False if the pairs have not been mapped yet, so that there are no models for that reason alone.
+    stage_seconds, configuration, versions : mapping, optional
+        See `SceneReport`.
+
+    Returns
+    -------
+    SceneReport
+    """
+    names = tuple(sorted(image_names))
+    pairs = tuple(sorted(pairs, key=lambda pair: (pair.name0, pair.name1)))
+    components = _components(pairs)
+    return SceneReport(
+        scene=scene,
+        image_names=names,
+        models=tuple(models),
+        pairs=pairs,
+        components=components,
+        missing=missing_images(names, pairs, components, models, left_out, mapped),
+        stage_seconds=dict(stage_seconds or {}),
+        configuration=dict(configuration or {}),
+        versions=dict(versions or {}),
+    )
+
+
+def _components(pairs: Iterable[PairStatistics]) -> tuple[tuple[str, ...], ...]:
+    """Connected components of the verified pairs, the largest first, equal sizes in order of names."""
+    parent: dict[str, str] = {}
+
+    def root(name: str) -> str:
+        while parent.setdefault(name, name) != name:
+            parent[name] = parent[parent[name]]
+            name = parent[name]
+        return name
+
+    for pair in pairs:
+        if pair.num_verified > 0:
+            parent[root(pair.name0)] = root(pair.name1)
+    members: dict[str, list[str]] = {}
+    for name in sorted(parent):
+        members.setdefault(root(name), []).append(name)
+    return tuple(sorted(map(tuple, members.values()), key=lambda names: (-len(names), names)))
+
+
+def _plain(value: Any) -> Any:
+    """Records as dicts, tuples as lists and NaN as None, all the way down."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {entry.name: _plain(getattr(value, entry.name)) for entry in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, StrEnum) else value
+
+
+def _model_from_dict(values: Mapping[str, Any]) -> ModelSummary:
+    floats = {key: math.nan if value is None else value for key, value in values.items()}
+    return ModelSummary(**(floats | {"image_names": tuple(values["image_names"])}))

@@ -1,0 +1,62 @@
+"""The commands that make each stage, with the options that a workspace remembers."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from corrsfm import config as cfg
+from corrsfm.config.fields import flags_of
+
+__all__ = ["STAGE_COMMANDS", "command_for"]
+
+
+STAGE_COMMANDS = {
+    "images": "extract",
+    "features": "extract",
+    "pairs": "pairs",
+    "matches": "match",
+    "pruned matches": "prune",
+    "verified matches": "prune",
+    "models": "reconstruct",
+}
+"""The stages, in order, and the command that makes each."""
+
+
+_OPTIONS: dict[str, dict[str, type]] = {
+    "extract": {
+        "images": cfg.ImagesConfig,
+        "features": cfg.FeaturesConfig,
+        "pairs": cfg.PairsConfig,
+        "matches": cfg.MatchesConfig,
+    },
+    "pairs": {"pairs": cfg.PairsConfig},
+    "match": {"matches": cfg.MatchesConfig},
+    "prune": {"pruned matches": cfg.PruneConfig, "verified matches": cfg.DatabaseConfig},
+    "reconstruct": {"models": cfg.ReconstructionConfig},
+}
+
+
+def command_for(stage: str, root: Path, images_dir: str, recorded: Mapping[str, dict[str, Any]]) -> str:
+    """The command that makes a stage, with the options that it was made with, quoted for a shell.
+
+    The seed is not recorded with a stage and so not repeated.
+
+    Parameters
+    ----------
+    stage : str
+    root : Path
+        The workspace.
+    images_dir : str
+        The folder of the photos, or a word in its place.
+    recorded : mapping
+        Stage → the options that it was made with, of the stages that finished.
+    """
+    command = STAGE_COMMANDS[stage]
+    words = ["corrsfm", command, *([images_dir] if command == "extract" else []), str(root)]
+    for name, options in _OPTIONS[command].items():
+        if name in recorded:
+            words += flags_of(options, recorded[name])
+    return shlex.join(words)

@@ -1,0 +1,323 @@
+"""A workspace: where every artefact lies, and what is finished.
+
+::
+
+    WORKSPACE/
+    ├── workspace.json      format version, image folder, and per stage: fingerprint, options, seconds
+    ├── images.txt          names of the photos, one per line
+    ├── images.json         photos and cameras as corrsfm knows them
+    ├── features.h5         keypoints and descriptors
+    ├── pairs.txt           pairs to match, ``name0 name1``
+    ├── pair_origins.tsv    the strategies that proposed each pair
+    ├── matches.h5          putative matches
+    ├── pruned.h5           pruned matches
+    ├── database.db         COLMAP database with verified two-view geometries
+    ├── sparse/0, 1, …      models, the largest first
+    ├── sparse.old/         models of earlier matches, put aside when mapping failed
+    ├── report.json, report.html
+    ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
+    └── log.txt             what pycolmap had to say
+
+Every file is written under another name and renamed, so a file that exists is whole. A stage is current if
+its recorded fingerprint, a hash of its options and of the fingerprints of its inputs, equals the wanted one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from corrsfm.errors import WorkspaceError
+from corrsfm.files import atomic_write_json
+from corrsfm.workspace.commands import command_for
+
+__all__ = ["StageRecord", "Workspace"]
+
+logger = logging.getLogger("corrsfm")
+
+FORMAT_VERSION = 1
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageRecord:
+    """What the workspace remembers of a finished stage.
+
+    Attributes
+    ----------
+    fingerprint : str
+        Hash of the stage's options and of the fingerprints of its inputs.
+    config : dict
+        The options, for people to read.
+    inputs : dict
+        Stage → fingerprint of what it read.
+    seconds : float
+        Wall-clock seconds of the run that finished it.
+    num_items, num_reused : int
+        Items of the stage, and how many of them an earlier run had done.
+    """
+
+    fingerprint: str
+    config: dict[str, Any] = field(default_factory=dict)
+    inputs: dict[str, str] = field(default_factory=dict)
+    seconds: float = 0.0
+    num_items: int = 0
+    num_reused: int = 0
+    finished_at: str = ""
+
+
+class Workspace:
+    """A folder with the artefacts of one scene.
+
+    Parameters
+    ----------
+    root : Path
+    create : bool
+        Make the folder if it does not exist; otherwise that is an error.
+    images_dir : Path, optional
+        Folder of the photos that it is for.
+
+    Raises
+    ------
+    WorkspaceError
+        If the folder is not a workspace, or one of another version, or its manifest is damaged, or it is the
+        folder of the photos.
+    """
+
+    def __init__(self, root: Path, *, create: bool = False, images_dir: Path | None = None) -> None:
+        if images_dir is not None and root.resolve() == images_dir.resolve():
+            raise WorkspaceError(
+                f"{root}: is the folder of the photos; choose another for the workspace, such as"
+                f" {root / 'corrsfm'}"
+            )
+        self.root = root
+        self.manifest = root / "workspace.json"
+        self.images_txt = root / "images.txt"
+        self.images_json = root / "images.json"
+        self.photo_cache = root / ".photos.json"
+        self.features = root / "features.h5"
+        self.pairs = root / "pairs.txt"
+        self.pair_origins = root / "pair_origins.tsv"
+        self.matches = root / "matches.h5"
+        self.pruned = root / "pruned.h5"
+        self.database = root / "database.db"
+        self.sparse = root / "sparse"
+        self.report_json = root / "report.json"
+        self.report_html = root / "report.html"
+        self.run_json = root / "run.json"
+        self.log = root / "log.txt"
+        if not self.manifest.exists():
+            self._start(create)
+        self._values = self._load()
+
+    def _start(self, create: bool) -> None:
+        if not create:
+            raise WorkspaceError(
+                f"{self.root}: not a corrsfm workspace; make one with: corrsfm extract IMAGES {self.root}"
+            )
+        if self.root.exists() and not self.root.is_dir():
+            raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")
+        # A workspace that lost its manifest still has what only corrsfm writes.
+        own = self.photo_cache.exists() or self.images_json.exists()
+        foreign = [path.name for path in (self.database, self.sparse) if path.exists()]
+        if foreign and not own:
+            raise WorkspaceError(
+                f"{self.root}: holds {' and '.join(foreign)} of another tool; choose an empty folder, "
+                "nothing was touched"
+            )
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise WorkspaceError(f"{self.root}: cannot be made ({error.strerror})") from error
+        atomic_write_json(self.manifest, {"format_version": FORMAT_VERSION, "images_dir": None, "stages": {}})
+
+    def _load(self) -> dict[str, Any]:
+        try:
+            values = json.loads(self.manifest.read_text(encoding="utf-8"))
+            version = values["format_version"]
+            if version == FORMAT_VERSION:
+                _check_manifest(values)
+        except PermissionError as error:
+            raise WorkspaceError(f"{self.manifest}: may not be read; check its permissions") from error
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise WorkspaceError(
+                f"{self.manifest}: damaged ({error!r}); delete this file alone and run the commands of the "
+                "workspace again, finished features and matches are kept"
+            ) from error
+        if version != FORMAT_VERSION:
+            raise WorkspaceError(
+                f"{self.root}: workspace of format version {version}, this corrsfm reads version "
+                f"{FORMAT_VERSION}; use the corrsfm that made it, or another folder"
+            )
+        return values
+
+    @contextlib.contextmanager
+    def lock(self) -> Iterator[None]:
+        """Hold the workspace for this process.
+
+        Raises
+        ------
+        WorkspaceError
+            If another process holds it, or nothing can be written there.
+        """
+        try:
+            handle = open(self.root / ".lock", "w", encoding="utf-8")  # noqa: SIM115
+        except OSError as error:
+            raise WorkspaceError(
+                f"{self.root}: nothing can be written there ({error.strerror}); check the permissions, or "
+                "work on a copy of the folder"
+            ) from error
+        with handle:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise WorkspaceError(
+                    f"{self.root}: another corrsfm works in this workspace; wait for it or choose another "
+                    "folder"
+                ) from error
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise WorkspaceError(f"{self.root}: cannot be locked ({error.strerror})") from error
+                logger.warning(
+                    "%s: this file system has no locks (%s); do not let a second corrsfm work there now",
+                    self.root,
+                    error.strerror,
+                )
+            self._values = self._load()
+            yield
+
+    @property
+    def images_dir(self) -> Path:
+        """Folder of the photos.
+
+        Raises
+        ------
+        WorkspaceError
+            If no photos were indexed yet.
+        """
+        if not self._values["images_dir"]:
+            raise WorkspaceError(
+                f"{self.root}: no photos indexed yet; run: corrsfm extract IMAGES {self.root}"
+            )
+        return Path(self._values["images_dir"])
+
+    @images_dir.setter
+    def images_dir(self, folder: Path) -> None:
+        self._values["images_dir"] = str(folder.resolve())
+        atomic_write_json(self.manifest, self._values)
+
+    def record_of(self, stage: str) -> StageRecord | None:
+        """What is recorded of a stage, or None if it never finished."""
+        values = self._values["stages"].get(stage)
+        return StageRecord(**values) if values else None
+
+    def is_current(self, stage: str, fingerprint: str, *artefacts: Path) -> bool:
+        """True if the stage finished with this fingerprint and its artefacts are still there."""
+        record = self.record_of(stage)
+        return (
+            record is not None
+            and record.fingerprint == fingerprint
+            and all(path.exists() for path in artefacts)
+        )
+
+    def require(self, stage: str) -> StageRecord:
+        """The record of a stage that must have finished, with inputs that have not changed since.
+
+        Raises
+        ------
+        WorkspaceError
+            Naming the command to run.
+        """
+        record = self.record_of(stage)
+        if record is None:
+            raise WorkspaceError(f"{self.root}: no {stage} yet; run: {self.command_for(stage)}")
+        for name, fingerprint in record.inputs.items():
+            if self.require(name).fingerprint != fingerprint:
+                raise WorkspaceError(
+                    f"{self.root}: {stage} are older than {name}; run: {self.command_for(stage)}"
+                )
+        return record
+
+    def current_record_of(self, stage: str) -> StageRecord | None:
+        """What is recorded of a stage if its inputs have not changed since; else None."""
+        try:
+            return self.require(stage)
+        except WorkspaceError:
+            return None
+
+    def command_for(self, stage: str, *, images_dir: str | None = None) -> str:
+        """The command that makes a stage, with the options that it was made with, quoted for a shell.
+
+        The seed is not recorded with a stage and so not repeated.
+
+        Parameters
+        ----------
+        stage : str
+        images_dir : str, optional
+            To take the place of the folder of photos that the workspace knows.
+        """
+        return command_for(
+            stage,
+            self.root,
+            images_dir or self._values["images_dir"] or "IMAGES",
+            {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
+        )
+
+    def finish(self, stage: str, record: StageRecord) -> None:
+        """Record a stage as finished now."""
+        if stage == "models":
+            self._values.pop("mapping_failed", None)
+        stamped = {**record.__dict__, "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
+        self._values["stages"][stage] = stamped
+        atomic_write_json(self.manifest, self._values)
+
+    def forget(self, stage: str) -> None:
+        """Drop the record of a stage, so that it is not taken for finished."""
+        if self._values["stages"].pop(stage, None) is not None:
+            atomic_write_json(self.manifest, self._values)
+
+    @property
+    def mapping_failed(self) -> bool:
+        """Whether mapping was tried on the verified matches that there are now and no model came out."""
+        verified = self.record_of("verified matches")
+        return verified is not None and self._values.get("mapping_failed") == verified.fingerprint
+
+    def put_models_aside(self) -> None:
+        """Remember that mapping failed, and move the models of earlier matches out of the way.
+
+        They go to ``sparse.old``, with the reports about them, so that nobody takes them for new. What was
+        put aside before is replaced.
+        """
+        self.forget("models")
+        if verified := self.record_of("verified matches"):
+            self._values["mapping_failed"] = verified.fingerprint
+            atomic_write_json(self.manifest, self._values)
+        if not self.sparse.is_dir():
+            self.run_json.unlink(missing_ok=True)
+            return
+        for path in (self.run_json, self.report_json, self.report_html):
+            if path.exists():
+                os.replace(path, self.sparse / path.name)
+        aside = self.sparse.with_name("sparse.old")
+        if aside.exists():
+            shutil.rmtree(aside)
+        os.replace(self.sparse, aside)
+        logger.warning("the models of the earlier matches were put aside: %s", aside)
+
+
+def _check_manifest(values: dict[str, Any]) -> None:
+    """Raise now what a damaged manifest would raise later."""
+    if not isinstance(values["images_dir"], str | None):
+        raise TypeError("images_dir is no text")
+    for record in values["stages"].values():
+        StageRecord(**record)

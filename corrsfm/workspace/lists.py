@@ -1,0 +1,124 @@
+"""The index of a workspace: which photos there are, which cameras took them and which pairs to match.
+
+`images.txt` names the photos and `pairs.txt` the pairs, one per line, for people and other tools;
+`images.json` adds hashes, cameras, masks and GPS positions, `pair_origins.tsv` where each pair came from.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from corrsfm.errors import WorkspaceError
+from corrsfm.files import atomic_write_json, atomic_write_text
+from corrsfm.types import Camera, ImageRecord, PairList
+from corrsfm.workspace.folder import Workspace
+
+__all__ = [
+    "Index",
+    "read_index",
+    "read_pairs",
+    "write_index",
+    "write_pairs",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Index:
+    """Photos of a scene, sorted by name, and their cameras.
+
+    Attributes
+    ----------
+    records : tuple of ImageRecord
+    cameras : tuple of Camera
+        ``records[i].camera_id`` counts into it.
+    """
+
+    records: tuple[ImageRecord, ...]
+    cameras: tuple[Camera, ...]
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the photos, sorted."""
+        return [record.name for record in self.records]
+
+    def camera_of(self, record: ImageRecord) -> Camera:
+        """The camera that took a photo."""
+        return self.cameras[record.camera_id]
+
+
+def write_index(workspace: Workspace, index: Index) -> None:
+    """Write `images.json`, then `images.txt`."""
+    atomic_write_json(
+        workspace.images_json,
+        {
+            "cameras": [dataclasses.asdict(camera) for camera in index.cameras],
+            "images": [dataclasses.asdict(record) for record in index.records],
+        },
+    )
+    atomic_write_text(workspace.images_txt, "".join(f"{name}\n" for name in index.names))
+
+
+def read_index(workspace: Workspace) -> Index:
+    """Read `images.json`.
+
+    Raises
+    ------
+    WorkspaceError
+        If it is missing or damaged.
+    """
+    path = workspace.images_json
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        cameras = tuple(Camera(**_tuples(entry, "params")) for entry in values["cameras"])
+        records = tuple(ImageRecord(**_tuples(entry, "gps")) for entry in values["images"])
+    except FileNotFoundError as error:
+        raise WorkspaceError(
+            f"{path}: missing; index the photos with: {workspace.command_for('images')}"
+        ) from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise WorkspaceError(
+            f"{path}: damaged ({error}); make it anew with: {workspace.command_for('images')}"
+        ) from error
+    return Index(records=records, cameras=cameras)
+
+
+def _tuples(entry: dict[str, Any], key: str) -> dict[str, Any]:
+    """JSON has no tuples."""
+    return {**entry, key: tuple(entry[key]) if entry[key] is not None else None}
+
+
+def write_pairs(workspace: Workspace, pair_list: PairList) -> None:
+    """Write `pair_origins.tsv`, then `pairs.txt`, which hloc reads too."""
+    lines = [f"{name0} {name1}\n" for name0, name1 in pair_list.pairs]
+    origins = [
+        f"{name0}\t{name1}\t{','.join(origin)}\n"
+        for (name0, name1), origin in zip(pair_list.pairs, pair_list.origins, strict=True)
+    ]
+    atomic_write_text(workspace.pair_origins, "".join(origins))
+    atomic_write_text(workspace.pairs, "".join(lines))
+
+
+def read_pairs(workspace: Workspace) -> PairList:
+    """The pairs of a workspace with their origins.
+
+    Raises
+    ------
+    WorkspaceError
+        If they are missing or damaged.
+    """
+    path = workspace.pair_origins
+    try:
+        # Not splitlines, which also ends a line at characters that a name may hold.
+        lines = path.read_text(encoding="utf-8").split("\n")
+        rows = [line.split("\t") for line in lines if line]
+        return PairList(
+            pairs=tuple((name0, name1) for name0, name1, _ in rows),
+            origins=tuple(tuple(origin.split(",")) for _, _, origin in rows),
+        )
+    except FileNotFoundError as error:
+        raise WorkspaceError(f"{path}: missing; run: {workspace.command_for('pairs')}") from error
+    except ValueError as error:
+        raise WorkspaceError(f"{path}: damaged; run: {workspace.command_for('pairs')} --overwrite") from error

@@ -1,0 +1,216 @@
+"""Bringing the items of a stage up to date: keep what is there, do what is missing, say why.
+
+An item (a photo's features, a pair's matches) carries the fingerprint of everything it was made from. A stage
+is the set of its items; it is current when every item is there with the fingerprint wanted now.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from tqdm import tqdm
+
+from corrsfm import config as cfg
+from corrsfm.errors import WorkspaceError
+from corrsfm.types import Pair
+from corrsfm.workspace.folder import StageRecord, Workspace
+from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.store import ItemStore
+
+__all__ = [
+    "StageOutcome",
+    "complete",
+    "explain",
+    "finish",
+    "mark_left_out",
+    "photos_left_out",
+    "require_database",
+    "wanted_matches",
+]
+
+logger = logging.getLogger("corrsfm")
+
+_LEFT_OUT = "left out"
+
+K = TypeVar("K")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOutcome:
+    """What a stage did.
+
+    Attributes
+    ----------
+    stage : str
+    num_items, num_reused : int
+        Items of the stage, and how many of them were there already.
+    seconds : float
+        Wall-clock seconds of this call.
+    skipped : bool
+        True if nothing was to do.
+    """
+
+    stage: str
+    num_items: int
+    num_reused: int = 0
+    seconds: float = 0.0
+    skipped: bool = False
+
+    def __str__(self) -> str:
+        """One line for a person; the columns of several stages are aligned."""
+        state = "kept" if self.skipped else f"{self.seconds:.1f} s"
+        return f"{self.stage:<17}{self.num_items:>8}   {state}"
+
+
+def complete(
+    workspace: Workspace,
+    stage: str,
+    store: ItemStore[K, T],
+    wanted: Mapping[K, str],
+    produce: Callable[[list[K]], Iterable[tuple[K, T]]],
+    config: Any,
+    *,
+    inputs: dict[str, str],
+    overwrite: bool,
+    unit: str,
+) -> StageOutcome:
+    """Bring a store of items to exactly the wanted ones, keeping those that are there.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    stage : str
+    store : ItemStore
+    wanted : mapping
+        Key → fingerprint of every item the stage consists of.
+    produce : callable
+        Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for. It
+        may first change what is ``wanted`` of the key, if it cannot make that.
+    config : dataclass
+        The stage's options, for the record.
+    inputs : dict
+        Stage → fingerprint of what the items are made from.
+    overwrite : bool
+        Do all items again.
+    unit : str
+        What an item is, for the progress bar.
+    """
+    started = time.monotonic()
+    fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
+    finished = set() if overwrite else store.finished(wanted)
+    missing = [key for key in wanted if key not in finished]
+    if not missing and workspace.is_current(stage, fingerprint, store.path):
+        store.discard_journal()
+        return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
+    explain(workspace, stage, config)
+    if finished and missing:
+        logger.info("%s: %d of %d kept, %d to do", stage, len(finished), len(wanted), len(missing))
+    try:
+        with tqdm(total=len(wanted), initial=len(finished), desc=stage, unit=unit, leave=False) as bar:
+            for key, item in produce(missing):
+                store.add(key, wanted[key], item)
+                bar.update()
+        workspace.forget(stage)
+        store.commit(
+            wanted, lambda keys: tqdm(keys, desc=f"writing {store.path.name}", unit=unit, leave=False)
+        )
+    finally:
+        store.close()
+    fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
+    outcome = StageOutcome(
+        stage=stage, num_items=len(wanted), num_reused=len(finished), seconds=time.monotonic() - started
+    )
+    finish(workspace, outcome, fingerprint, config, inputs=inputs)
+    return outcome
+
+
+def finish(
+    workspace: Workspace,
+    outcome: StageOutcome,
+    fingerprint: str,
+    config: Any,
+    inputs: dict[str, str] | None = None,
+) -> None:
+    workspace.finish(
+        outcome.stage,
+        StageRecord(
+            fingerprint=fingerprint,
+            config=cfg.to_dict(config),
+            inputs=inputs or {},
+            seconds=round(outcome.seconds, 3),
+            num_items=outcome.num_items,
+            num_reused=outcome.num_reused,
+        ),
+    )
+
+
+def explain(workspace: Workspace, stage: str, config: Any) -> None:
+    """Say which changed option makes a finished stage stale."""
+    record = workspace.record_of(stage)
+    if record is None:
+        return
+    new = cfg.to_dict(config)
+    changes = [
+        f"{key} {_shown(record.config.get(key))} → {_shown(new[key])}"
+        for key in new
+        if record.config.get(key) != new[key]
+    ]
+    reason = ", ".join(changes) if changes else "what it depends on changed"
+    logger.info("%s: redone where needed (%s)", stage, reason)
+
+
+def _shown(value: object) -> str:
+    return "+".join(value) if isinstance(value, list) else str(value)
+
+
+def wanted_matches(workspace: Workspace) -> dict[Pair, str]:
+    """Fingerprint that the putative matches of each pair must carry."""
+    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(read_index(workspace).names)
+    return {
+        pair: cfg.config_hash("matches-1", fingerprints[pair[0]], fingerprints[pair[1]])
+        for pair in read_pairs(workspace).pairs
+    }
+
+
+def mark_left_out(fingerprint: str) -> str:
+    """Fingerprint for a photo that was left out, in place of that of its features.
+
+    It is another one so that the photo is tried again when there is another chance.
+    """
+    return f"{_LEFT_OUT} {fingerprint}"
+
+
+def photos_left_out(workspace: Workspace, names: Iterable[str]) -> set[str]:
+    """Photos of the index that could not be read and so have no features.
+
+    Raises
+    ------
+    WorkspaceError
+        If the features cannot be read.
+    """
+    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(names)
+    return {name for name, fingerprint in fingerprints.items() if fingerprint.startswith(_LEFT_OUT)}
+
+
+def require_database(workspace: Workspace) -> StageRecord:
+    """The record of the verified matches, whose database must be whole.
+
+    Raises
+    ------
+    WorkspaceError
+        Naming the command to run.
+    """
+    from corrsfm.colmap.sqlite import is_truncated
+
+    record = workspace.require("verified matches")
+    path = workspace.database
+    if not path.is_file() or is_truncated(path):
+        what = "damaged, its end is missing" if path.is_file() else "missing"
+        raise WorkspaceError(f"{path}: {what}; run: {workspace.command_for('verified matches')}")
+    return record

@@ -1,0 +1,41 @@
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2  # noqa: F401  (before pycolmap)
+import pycolmap
+import pytest
+
+from corrsfm.colmap.pairs import read_verified_pairs
+from corrsfm.colmap.sqlite import is_truncated
+from corrsfm.errors import DatabaseError
+
+
+def test_termination_is_quiet():
+    code = "import os, signal, corrsfm.colmap; os.kill(os.getpid(), signal.SIGTERM)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGTERM
+    assert done.stderr == b""
+
+
+def test_a_database_without_its_end_is_told_from_whole_ones_and_other_files(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    pycolmap.Database.open(path).close()
+    whole = path.read_bytes()
+    assert not is_truncated(path)
+    for size in (0, 10, 99, 100, 5000, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        assert is_truncated(path), size
+    path.write_bytes(b"notes" * 1000)
+    assert not is_truncated(path)
+
+
+def test_a_database_that_sqlite_finds_damaged_is_said_to_be(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    pycolmap.Database.open(path).close()
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(
+        DatabaseError, match=r"database\.db: .*malformed.*; delete the file and make it again"
+    ):
+        read_verified_pairs(path)

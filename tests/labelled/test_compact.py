@@ -1,0 +1,75 @@
+"""The compact pair file: what goes in comes out within the quantisation, labels included."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_scene import make_scene
+
+from corrsfm.errors import InputError
+from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
+from corrsfm.labelled.compact import CompactScene, read_labelled_pairs, read_scenes, write_scenes
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CompactScene]:
+    path = tmp_path_factory.mktemp("compact") / "pairs.h5"
+    scene = make_scene()
+    assert write_scenes(path, [make_scene("attic", seed=1), scene]) == 12
+    return path, scene
+
+
+def test_round_trip_is_exact_within_the_quantisation(written):
+    path, scene = written
+    attic, read = read_scenes(path)
+    assert (attic.name, read.name) == ("attic", "yard")
+    assert read.image_names == scene.image_names and read.cameras == scene.cameras
+    for name in (
+        "rotations",
+        "translations",
+        "keypoint_offsets",
+        "pairs",
+        "covisible",
+        "match_offsets",
+        "neighbours",
+        "mutual",
+    ):
+        np.testing.assert_array_equal(getattr(read, name), getattr(scene, name), err_msg=name)
+    assert np.abs(read.keypoints - scene.keypoints).max() <= 0.5 * 960 / 65535 + 1e-4
+    assert np.abs(read.corrections - scene.corrections).max() < 1e-5
+    assert np.abs(read.ratios - scene.ratios).max() <= 0.5 / 255 + 1e-6
+    assert np.abs(read.log_scales - scene.log_scales).max() < 2e-3
+    turn = np.abs(read.orientations - scene.orientations)
+    assert np.minimum(turn, 2 * np.pi - turn).max() < 1e-4
+
+
+def test_labels_use_the_full_camera_and_inputs_the_pinhole(written):
+    path, scene = written
+    pairs = [pair for pair in read_labelled_pairs(path) if pair.scene == "yard"]
+    assert len(pairs) == 6
+    pair = pairs[0]
+    assert len(pair) == 59  # one keypoint has no neighbour
+    assert pair.label_distances[:29].max() < 1e-8
+    essential = essential_from_pose(
+        *relative_pose(scene.rotations[0], scene.translations[0], scene.rotations[1], scene.translations[1])
+    )
+    by_pinhole = symmetric_epipolar_distance_sq(essential, pair.correspondences)[:29]
+    assert by_pinhole.max() > 100 * pair.label_distances[:29].max()
+    # Pixels come back through the camera that the record names.
+    np.testing.assert_allclose(pair.as_correspondences().points0[0], scene.keypoints[0], atol=0.02)
+
+
+def test_drawing_pairs_of_a_scene_does_not_depend_on_other_scenes(written, tmp_path):
+    path, scene = written
+    write_scenes(tmp_path / "one.h5", [scene])
+    both = [pair for pair in read_labelled_pairs(path, num_per_scene=2, seed=4) if pair.scene == "yard"]
+    alone = list(read_labelled_pairs(tmp_path / "one.h5", num_per_scene=2, seed=4))
+    assert len(alone) == 2
+    for first, second in zip(both, alone, strict=True):
+        np.testing.assert_array_equal(first.correspondences, second.correspondences)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    (tmp_path / "text.h5").write_text("no")
+    with pytest.raises(InputError, match=r"text\.h5: cannot be read as HDF5 .*corrsfm train prepare"):
+        read_scenes(tmp_path / "text.h5")

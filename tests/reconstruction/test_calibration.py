@@ -1,0 +1,113 @@
+"""Focal lengths that cannot be, and mapping that holds them at first."""
+
+import logging
+from pathlib import Path
+
+import pycolmap
+import pytest
+
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.models import observation_errors
+from corrsfm.config import ReconstructionConfig
+from corrsfm.reconstruction import mapper as reconstruction
+from corrsfm.reconstruction.calibration import focal_length_ratios, is_plausible, refine_intrinsics
+from corrsfm.reconstruction.mapper import reconstruct
+
+
+def synthesize(path: Path) -> pycolmap.Reconstruction:
+    """A database of exact matches of ten photos with a camera each, and its true model."""
+    pycolmap.set_random_seed(0)
+    with pycolmap.Database.open(path) as database:
+        return pycolmap.synthesize_dataset(
+            pycolmap.SyntheticDatasetOptions(
+                num_rigs=10, num_cameras_per_rig=1, num_frames_per_rig=1, num_points3D=150,
+                camera_has_prior_focal_length=False,
+            ),
+            database,
+        )  # fmt: skip
+
+
+def set_focal_length(model: pycolmap.Reconstruction, number: int, factor: float) -> None:
+    camera = model.cameras[sorted(model.cameras)[number]]
+    for index in camera.focal_length_idxs():
+        camera.params[index] *= factor
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> pycolmap.Reconstruction:
+    return synthesize(tmp_path / "database.db")
+
+
+def test_equal_cameras_are_plausible(model: pycolmap.Reconstruction) -> None:
+    ratios = focal_length_ratios(model)
+    assert len(ratios) == 10 and ratios[0] == ratios[-1]
+    assert is_plausible(model)
+
+
+def test_a_focal_length_that_no_camera_has_is_not_plausible(model: pycolmap.Reconstruction) -> None:
+    set_focal_length(model, 3, 1e6)
+    assert not is_plausible(model)
+
+
+def test_two_lenses_are_plausible_but_not_many_different_focal_lengths(
+    model: pycolmap.Reconstruction,
+) -> None:
+    for number in range(2):
+        set_focal_length(model, number, 3.0)
+    assert is_plausible(model)
+    set_focal_length(model, 2, 3.0)
+    assert not is_plausible(model)
+
+
+def test_known_focal_lengths_are_believed(model: pycolmap.Reconstruction) -> None:
+    set_focal_length(model, 3, 1e6)
+    for camera in model.cameras.values():
+        camera.has_prior_focal_length = True
+    assert is_plausible(model)
+
+
+def test_refinement_finds_the_focal_lengths(model: pycolmap.Reconstruction) -> None:
+    true = focal_length_ratios(model)
+    for number in range(10):
+        set_focal_length(model, number, 1.03)
+    assert observation_errors(model).mean() > 1.0
+    with colmap_log():
+        refine_intrinsics(model, num_threads=1)
+    assert observation_errors(model).mean() < 0.01
+    assert focal_length_ratios(model) == pytest.approx(true, rel=1e-3)
+
+
+def test_mapping_that_bends_is_done_again_with_intrinsics_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    synthesize(tmp_path / "database.db")
+    true_mapping, refined = pycolmap.incremental_mapping, []
+
+    def bend(*arguments, **callbacks):
+        refined.append(arguments[3].ba_refine_focal_length)
+        mapped = true_mapping(*arguments, **callbacks)
+        if refined[-1]:
+            # As where focal lengths ran away: one cannot be, and a photo is lost.
+            set_focal_length(mapped[0], 0, 1e6)
+            mapped[0].deregister_frame(sorted(mapped[0].reg_frame_ids())[-1])
+        return mapped
+
+    monkeypatch.setattr(reconstruction.pycolmap, "incremental_mapping", bend)
+    with caplog.at_level(logging.WARNING):
+        (summary,) = reconstruct(
+            tmp_path / "database.db", None, tmp_path / "sparse", config=ReconstructionConfig(), num_threads=1
+        )
+    assert refined == [True, False]
+    assert summary.num_images == 10
+    assert summary.mean_error_px < 0.01
+    assert "looks wrong" not in caplog.text
+
+
+def test_a_model_that_stays_wrong_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    synthesize(tmp_path / "database.db")
+    monkeypatch.setattr(reconstruction, "is_plausible", lambda model: False)
+    with caplog.at_level(logging.WARNING):
+        reconstruct(tmp_path / "database.db", None, tmp_path / "sparse", config=ReconstructionConfig())
+    assert "the model looks wrong" in caplog.text and "--camera-mode single" in caplog.text

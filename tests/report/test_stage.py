@@ -1,0 +1,80 @@
+"""The summary of a workspace: only what belongs together."""
+
+from pathlib import Path
+
+import cv2  # noqa: F401  (before pycolmap)
+import pycolmap
+import pytest
+from photos import write_photos
+
+from corrsfm import config as cfg
+from corrsfm import pipeline
+from corrsfm.errors import WorkspaceError
+from corrsfm.evaluation.scenes.score import find_model
+from corrsfm.report import MissingReason
+from corrsfm.workspace import StageRecord, Workspace
+
+RUN = cfg.RunConfig(threads=1, device="cpu")
+
+
+def prune(workspace: Workspace, max_ratio: float) -> None:
+    config = cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=max_ratio)
+    pipeline.prune_matches(workspace, config, RUN)
+    pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN)
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    """Of three photos, with a model that counts as made from the verified matches."""
+    write_photos(tmp_path / "photos", 3)
+    workspace = Workspace(tmp_path / "scene", create=True)
+    pipeline.index_photos(workspace, tmp_path / "photos", cfg.ImagesConfig(), RUN)
+    pipeline.extract_features(workspace, cfg.FeaturesConfig(max_features=60), RUN)
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN)
+    prune(workspace, 0.8)
+    (workspace.sparse / "0").mkdir(parents=True)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3, num_points3D=20)
+    pycolmap.synthesize_dataset(options).write_binary(str(workspace.sparse / "0"))
+    verified = workspace.require("verified matches").fingerprint
+    config = cfg.to_dict(cfg.ReconstructionConfig(min_model_size=2))
+    workspace.finish(
+        "models",
+        StageRecord(fingerprint="f", inputs={"verified matches": verified}, config=config, seconds=7.5),
+    )
+    return workspace
+
+
+def test_current_models_are_reported(workspace: Workspace) -> None:
+    summary = pipeline.report(workspace)
+    assert [model.num_points for model in summary.models] == [20]
+    assert summary.stage_seconds["models"] == 7.5
+    assert find_model(workspace.root) == workspace.sparse / "0"
+
+
+def test_models_of_earlier_matches_are_not_mixed_with_new_ones(
+    workspace: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    prune(workspace, 0.3)
+    summary = pipeline.report(workspace)
+    assert summary.models == ()
+    assert {image.reason for image in summary.missing} == {MissingReason.NOT_MAPPED}
+    assert "models" not in summary.stage_seconds and "models" not in summary.configuration
+    command = f"run: corrsfm reconstruct {workspace.root} --min-model-size 2"
+    assert f"models are older than the matches; {command}" in caplog.text
+    with pytest.raises(WorkspaceError, match=f"models are older than verified matches; {command}"):
+        find_model(workspace.root)
+
+
+def test_counts_of_a_pair_are_those_of_its_matches(workspace: Workspace) -> None:
+    from corrsfm.workspace.hloc import MATCHES, PRUNED
+    from corrsfm.workspace.lists import read_pairs
+    from corrsfm.workspace.store import ItemStore
+
+    matches, pruned = ItemStore(workspace.matches, MATCHES), ItemStore(workspace.pruned, PRUNED)
+    pairs = pipeline.report(workspace).pairs
+    assert [(pair.name0, pair.name1) for pair in pairs] == sorted(read_pairs(workspace).pairs)
+    for pair in pairs:
+        key = (pair.name0, pair.name1)
+        assert pair.num_putative == len(matches.read(key)) > pair.num_pruned
+        assert pair.num_pruned == len(pruned.read(key).indices) > 0

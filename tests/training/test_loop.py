@@ -1,0 +1,151 @@
+"""The training loop: learns one batch by heart, resumes exactly, survives what is not finite."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from labelled_scene import make_scene
+
+from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.labelled.compact import write_scenes
+from corrsfm.model import load_network, read_provenance, save_network
+from corrsfm.training.checkpoint import load_state
+from corrsfm.training.config import AugmentConfig, Schedule, TrainConfig, TrainRecipe
+from corrsfm.training.dataset import RealPairs, generator_for
+from corrsfm.training.loop import Trainer, learning_rate_factor, train
+
+CPU = torch.device("cpu")
+TINY = {
+    "channels": 8, "clusters": 4, "heads": 2, "mlp_ratio": 1, "oa_filters": 1, "motion_stacking": 1,
+    "fusion_rounds": 1, "neighbors": [3, 3], "side_channels": 5,
+}  # fmt: skip
+
+
+def make_recipe(folder, **options) -> TrainRecipe:
+    values = {"batch_size": 4, "num_matches": 48, "max_steps": 6, "essential_start": 0.3, "log_every": 1}
+    return TrainRecipe(train=TrainConfig(output=folder, **{**values, **options}), network=TINY)
+
+
+@pytest.fixture(scope="module")
+def data() -> RealPairs:
+    return RealPairs([make_scene("a"), make_scene("b", seed=1)], CPU)
+
+
+def test_overfits_one_batch(data, tmp_path):
+    recipe = make_recipe(tmp_path, learning_rate=1e-2, ema_decay=0.0)
+    trainer = Trainer(recipe, data, CPU)
+    batch = data.sample(4, 48, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    trainer.draw = lambda step: batch  # type: ignore[method-assign]
+    losses = [trainer.train_step(0.25)["loss"] for _ in range(60)]
+    assert losses[-1] < 0.45 * losses[0]
+
+
+def test_stop_and_resume_equals_a_straight_run_bitwise(data, tmp_path):
+    straight = Trainer(make_recipe(tmp_path / "straight"), data, CPU)
+    straight.run()
+    stopped = Trainer(make_recipe(tmp_path / "stopped"), data, CPU)
+    for _ in range(3):
+        stopped.train_step(stopped.progress)
+    stopped.save()
+    torch.manual_seed(99)
+    resumed = Trainer(make_recipe(tmp_path / "stopped"), data, CPU)
+    resumed.load()
+    assert resumed.step == 3
+    resumed.run()
+    for name in ("network", "average", "optimiser", "random"):
+        first, second = (
+            load_state(tmp_path / run / "state.pt", CPU)[name] for run in ("straight", "stopped")
+        )
+        assert_equal(first, second, name)
+
+
+def assert_equal(first, second, where):
+    if isinstance(first, torch.Tensor):
+        assert torch.equal(first, second), where
+    elif isinstance(first, dict):
+        assert first.keys() == second.keys(), where
+        for key in first:
+            assert_equal(first[key], second[key], f"{where}.{key}")
+    elif isinstance(first, list):
+        for index, (a, b) in enumerate(zip(first, second, strict=True)):
+            assert_equal(a, b, f"{where}[{index}]")
+    else:
+        assert first == second, where
+
+
+def test_run_from_files_writes_a_network_that_says_where_it_comes_from(tmp_path):
+    write_scenes(tmp_path / "train.h5", [make_scene("a")])
+    recipe = make_recipe(tmp_path / "run", max_steps=2, train_files=(tmp_path / "train.h5",))
+    rows = []
+    path = train(recipe, device=CPU, on_log=rows.append)
+    assert load_network(path).config.channels == 8
+    provenance = read_provenance(path)
+    assert provenance["scenes"] == ["a"] and provenance["steps"] == 2 and provenance["seed"] == 0
+    assert [row["step"] for row in rows] == [1, 2]
+    assert (tmp_path / "run" / "log.csv").read_text().count("\n") == 3
+    with pytest.raises(ConfigError, match="holds a run already; try --resume"):
+        train(recipe, device=CPU)
+    assert train(recipe, device=CPU, resume=True) == path
+
+
+def test_steps_that_are_not_finite_are_counted_and_change_nothing(data, tmp_path):
+    trainer = Trainer(make_recipe(tmp_path), data, CPU)
+    before = {name: value.clone() for name, value in trainer.network.named_parameters()}
+    draw = trainer.draw
+
+    def broken(step):
+        batch = draw(step)
+        return dataclasses.replace(batch, matrix=batch.matrix * torch.nan)
+
+    trainer.draw = broken  # type: ignore[method-assign]
+    assert trainer.train_step(0.9) == {}
+    assert trainer.num_skipped == 1 and trainer.step == 1
+    for name, value in trainer.network.named_parameters():
+        assert torch.equal(value, before[name]), name
+
+
+def test_a_run_bounded_by_time_ends_at_learning_rate_zero(data, tmp_path):
+    rows = []
+    recipe = make_recipe(tmp_path, max_minutes=0.03)
+    Trainer(recipe, data, CPU, on_log=rows.append).run()
+    assert rows[-2]["minutes"] <= 0.03 <= rows[-1]["minutes"]
+    assert rows[-1]["learning_rate"] < rows[len(rows) // 2]["learning_rate"]
+
+
+@pytest.mark.parametrize("schedule", list(Schedule))
+def test_schedules_rise_to_one_and_fall_to_zero(schedule):
+    assert learning_rate_factor(0.1, 0.1, schedule) == pytest.approx(1.0)
+    assert learning_rate_factor(1.0, 0.1, schedule) == pytest.approx(0.0, abs=1e-12)
+    assert learning_rate_factor(0.55, 0.1, schedule) == pytest.approx(0.5)
+    assert learning_rate_factor(0.0, 0.1, schedule) == pytest.approx(
+        0.04 if schedule is Schedule.ONE_CYCLE else 0.0
+    )
+    assert math.isfinite(learning_rate_factor(0.0, 0.0, schedule))
+
+
+def test_a_run_starts_from_the_weights_of_a_checkpoint(data, tmp_path):
+    first = Trainer(make_recipe(tmp_path / "first"), data, CPU)
+    save_network(first.network, tmp_path / "first.pt")
+    recipe = make_recipe(tmp_path / "second", initial=str(tmp_path / "first.pt"), seed=7)
+    for network in (recipe.network, {}):
+        trainer = Trainer(dataclasses.replace(recipe, network=network), data, CPU)
+        assert_equal(dict(trainer.network.state_dict()), dict(first.network.state_dict()), "network")
+        assert trainer.step == 0
+    trainer.save()
+    assert read_provenance(tmp_path / "second" / "latest.pt")["recipe"]["train"]["initial"] == "first.pt"
+    with pytest.raises(ConfigError, match=r"initial checkpoint .*first\.pt"):
+        Trainer(dataclasses.replace(recipe, network={**TINY, "channels": 12}), data, CPU)
+
+
+def test_resuming_another_network_is_refused(data, tmp_path):
+    Trainer(make_recipe(tmp_path), data, CPU).save()
+    other = dataclasses.replace(make_recipe(tmp_path), network={**TINY, "channels": 12})
+    with pytest.raises(ConfigError, match="another network"):
+        Trainer(other, data, CPU).load()
+
+
+def test_a_state_of_another_kind_is_refused(tmp_path):
+    torch.save({"format": "other"}, tmp_path / "state.pt")
+    with pytest.raises(CheckpointError, match="not the state"):
+        load_state(tmp_path / "state.pt", CPU)

@@ -1,0 +1,172 @@
+"""Preparing pairs: splits, the choice of pairs, scenes of photos, both layouts; recipes."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from corrsfm.errors import ConfigError, InputError
+from corrsfm.labelled.compact import read_scenes
+from corrsfm.labelled.oanet import read_pairs
+from corrsfm.model import CorrAdaptor, NetworkConfig
+from corrsfm.training.config import AugmentConfig, PrepareConfig, load_recipe
+from corrsfm.training.dataset import RealPairs, generator_for
+from corrsfm.training.loop import network_config
+from corrsfm.training.prepare import (
+    choose_pairs,
+    prepare_file,
+    prepare_oanet,
+    prepare_scene,
+    read_splits,
+    scenes_of_split,
+)
+from corrsfm.workspace import StageRecord, Workspace
+
+
+def test_splits_of_the_photo_scenes_are_disjoint(shared_dir):
+    splits = read_splits(shared_dir / "photos" / "splits.json")
+    assert {name: len(scenes) for name, scenes in splits.items()} == {"train": 54, "val": 6, "test": 13}
+    everything = [scene for scenes in splits.values() for scene in scenes]
+    assert len(set(everything)) == 73
+
+
+def test_a_scene_in_two_splits_is_refused(tmp_path):
+    path = tmp_path / "splits.json"
+    path.write_text(json.dumps({"train": ["a", "b"], "test": ["b"]}))
+    with pytest.raises(InputError, match="more than once: b"):
+        read_splits(path)
+    path.write_text(json.dumps({"train": ["a"]}))
+    assert scenes_of_split(Path("photos"), path, "train") == [Path("photos/a")]
+    with pytest.raises(InputError, match="no split 'test'"):
+        scenes_of_split(Path("photos"), path, "test")
+
+
+def test_chosen_pairs_spread_over_the_range_of_difficulty():
+    covisible = {(i, j): 1 + i + j for i in range(30) for j in range(i + 1, 30)}
+    chosen = choose_pairs(covisible, 40, seed=0)
+    assert len(chosen) == len(set(chosen)) == 40
+    assert chosen == choose_pairs(covisible, 40, seed=0) != choose_pairs(covisible, 40, seed=1)
+    counts = sorted(covisible[pair] for pair in chosen)
+    expected = np.quantile(sorted(covisible.values()), [0.1, 0.5, 0.9])
+    np.testing.assert_allclose(np.quantile(counts, [0.1, 0.5, 0.9]), expected, atol=4)
+    assert choose_pairs(covisible, 0, seed=0) == sorted(covisible)
+
+
+@pytest.fixture(scope="module")
+def small_scene(shared_dir, tmp_path_factory) -> Path:
+    """Three photos of a real scene."""
+    source = shared_dir / "photos" / "olsson_statue_niche"
+    folder = tmp_path_factory.mktemp("scenes") / "niche"
+    (folder / "images").mkdir(parents=True)
+    names = sorted(path.name for path in (source / "images").iterdir())[:3]
+    for name in names:
+        (folder / "images" / name).symlink_to(source / "images" / name)
+    (folder / "cameras.txt").write_text((source / "cameras.txt").read_text())
+    lines = (source / "images.txt").read_text().splitlines()
+    kept = [f"{line}\n\n" for line in lines if line.split() and line.split()[-1] in names]
+    (folder / "images.txt").write_text("".join(kept))
+    (folder / "points3D.txt").write_text("")
+    lines = (source / "covisibility.txt").read_text().splitlines()
+    (folder / "covisibility.txt").write_text(
+        "\n".join(line for line in lines if line.split()[0] in names and line.split()[1] in names)
+    )
+    return folder
+
+
+CONFIG = PrepareConfig(max_features=300)
+
+
+def test_prepared_pairs_of_photos_have_right_matches_on_their_epipolar_lines(small_scene):
+    scene = prepare_scene(small_scene, CONFIG)
+    assert len(scene.image_names) == 3 and len(scene.pairs) == 3
+    pair = scene.pair(0)
+    assert len(pair) == 300
+    good = pair.mutual & (pair.ratios < 0.7)
+    assert good.sum() > 20
+    assert (pair.label_distances[good] < 1e-4).mean() > 0.9
+    assert pair.inliers().mean() < 0.9
+    # The lens of this camera is far from a pinhole.
+    assert np.abs(scene.corrections).max() > 0.01
+
+
+def test_both_layouts_train_alike(small_scene, tmp_path):
+    assert prepare_file(tmp_path / "pairs.h5", [small_scene], CONFIG) == [("niche", 3)]
+    assert prepare_oanet(tmp_path / "oanet.h5", [small_scene], CONFIG) == [("niche", 3)]
+    assert len(read_scenes(tmp_path / "pairs.h5")) == 1
+    assert len(list(read_pairs(tmp_path / "oanet.h5"))) == 3
+    device = torch.device("cpu")
+    nothing = AugmentConfig(
+        **{name: 0.0 for name in AugmentConfig.__dataclass_fields__ if name.endswith("probability")}
+    )
+    compact, oanet = (
+        RealPairs.from_files([tmp_path / name], device).sample(
+            4, 200, nothing, generator_for(0, 0, 0, device)
+        )
+        for name in ("pairs.h5", "oanet.h5")
+    )
+    assert compact.correspondences.shape == oanet.correspondences.shape == (4, 200, 4)
+    assert float(oanet.distances().min()) < 1e-5
+
+
+def test_a_workspace_is_a_scene(small_scene, tmp_path):
+    workspace = Workspace(tmp_path / "work", create=True)
+    workspace.images_dir = small_scene / "images"
+    workspace.finish("images", StageRecord(fingerprint="x"))
+    model = tmp_path / "work" / "sparse" / "0"
+    model.mkdir(parents=True)
+    for name in ("cameras.txt", "images.txt", "points3D.txt"):
+        (model / name).write_text((small_scene / name).read_text())
+    # Without covisibility.txt the pairs are those that share points of the model; this one has none.
+    with pytest.raises(InputError, match="no pair of photos"):
+        prepare_scene(tmp_path / "work", CONFIG)
+    (tmp_path / "work" / "covisibility.txt").write_text((small_scene / "covisibility.txt").read_text())
+    assert len(prepare_scene(tmp_path / "work", CONFIG).pairs) == 3
+
+
+def test_rendered_views_are_training_data(repository):
+    config = PrepareConfig(max_features=300, max_pairs_per_scene=4)
+    scene = prepare_scene(repository / "sample_scenes" / "courtyard", config)
+    pairs = [scene.pair(index) for index in range(len(scene.pairs))]
+    assert len(pairs) == 4
+    for pair in pairs:
+        distinctive = pair.mutual & (pair.ratios < 0.7)
+        # Exact cameras: distinctive matches lie on the true epipolar lines, most others do not.
+        assert pair.inliers()[distinctive].mean() > 0.8
+        assert pair.inliers()[~pair.mutual].mean() < 0.3
+
+
+def test_a_folder_without_a_model_is_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no COLMAP model"):
+        prepare_scene(tmp_path, CONFIG)
+
+
+@pytest.mark.parametrize("name", ["train_paper", "train_side", "train_small"])
+def test_recipes_build_their_networks(repository, name):
+    recipe = load_recipe(repository / "pipelines" / f"{name}.toml")
+    config = network_config(recipe)
+    assert config.side_channels == (0 if name == "train_paper" else 5)
+    num_parameters = sum(p.numel() for p in CorrAdaptor.from_config(config).parameters())
+    if name == "train_small":
+        assert num_parameters <= 1_000_000
+    else:
+        assert config.channels == NetworkConfig().channels
+
+
+def test_the_second_part_of_the_small_recipe_continues_the_first(repository):
+    first, second = (
+        load_recipe(repository / "pipelines" / f"{name}.toml") for name in ("train_small", "train_small_more")
+    )
+    assert Path(second.train.initial) == first.train.output / "latest.pt"
+    assert second.network == {}
+    assert second.train.train_files == first.train.train_files
+
+
+def test_a_recipe_with_an_unknown_key_is_refused(tmp_path):
+    (tmp_path / "a.toml").write_text("[train]\nlearning_rat = 1e-3\n")
+    with pytest.raises(ConfigError, match="learning_rat"):
+        load_recipe(tmp_path / "a.toml")
+    (tmp_path / "b.toml").write_text("[trian]\n")
+    with pytest.raises(ConfigError, match="trian"):
+        load_recipe(tmp_path / "b.toml")

@@ -1,0 +1,237 @@
+"""Workspaces: records of stages, locks, and clear refusals."""
+
+import errno
+import fcntl
+import json
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from corrsfm import config as cfg
+from corrsfm.cli import main
+from corrsfm.errors import WorkspaceError
+from corrsfm.workspace import StageRecord, Workspace
+from corrsfm.workspace.commands import STAGE_COMMANDS
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    return Workspace(tmp_path / "scene", create=True)
+
+
+def test_records_survive_reopening(workspace: Workspace) -> None:
+    workspace.finish("features", StageRecord(fingerprint="f", config={"max_features": 3}, seconds=1.5))
+    record = Workspace(workspace.root).record_of("features")
+    assert record is not None
+    assert (record.fingerprint, record.config, record.seconds) == ("f", {"max_features": 3}, 1.5)
+
+
+def test_a_stage_is_current_only_with_its_fingerprint_and_its_file(workspace: Workspace) -> None:
+    workspace.finish("features", StageRecord(fingerprint="f"))
+    assert not workspace.is_current("features", "f", workspace.features)
+    workspace.features.touch()
+    assert workspace.is_current("features", "f", workspace.features)
+    assert not workspace.is_current("features", "g", workspace.features)
+    workspace.forget("features")
+    assert not workspace.is_current("features", "f", workspace.features)
+
+
+def test_a_missing_stage_names_the_command_that_makes_it(workspace: Workspace) -> None:
+    with pytest.raises(WorkspaceError, match=f"no matches yet; run: corrsfm match {workspace.root}"):
+        workspace.require("matches")
+
+
+def test_a_stage_whose_input_changed_names_the_command_that_redoes_it(workspace: Workspace) -> None:
+    workspace.finish("features", StageRecord(fingerprint="f1"))
+    workspace.finish("matches", StageRecord(fingerprint="m", inputs={"features": "f1"}))
+    workspace.finish("pruned matches", StageRecord(fingerprint="p", inputs={"matches": "m"}))
+    assert workspace.require("pruned matches").fingerprint == "p"
+    workspace.finish("features", StageRecord(fingerprint="f2"))
+    with pytest.raises(WorkspaceError, match="matches are older than features; run: corrsfm match"):
+        workspace.require("pruned matches")
+
+
+def test_the_command_to_run_has_the_recorded_options_quoted_for_the_shell(tmp_path: Path) -> None:
+    workspace = Workspace(tmp_path / "my scene", create=True)
+    assert workspace.command_for("features") == f"corrsfm extract IMAGES '{workspace.root}'"
+    workspace.images_dir = tmp_path / "photos"
+    configs = {
+        "images": cfg.ImagesConfig(skip_unreadable=True),
+        "features": cfg.FeaturesConfig(max_features=3, root_sift=False),
+        "pairs": cfg.PairsConfig(pairing=(cfg.PairStrategy.SEQUENTIAL, cfg.PairStrategy.SPATIAL)),
+        "pruned matches": cfg.PruneConfig(method=cfg.PruneMethod.RATIO, model=Path("a b.pth")),
+        "verified matches": cfg.DatabaseConfig(min_num_inliers=20),
+        "models": cfg.ReconstructionConfig(),
+    }
+    for stage, config in configs.items():
+        workspace.finish(stage, StageRecord(fingerprint="f", config=cfg.to_dict(config)))
+    pairing = "--pairing sequential --pairing spatial"
+    assert workspace.command_for("pairs") == f"corrsfm pairs '{workspace.root}' {pairing}"
+    assert workspace.command_for("features") == (
+        f"corrsfm extract {tmp_path}/photos '{workspace.root}' --skip-unreadable --max-features 3 "
+        f"--no-root-sift {pairing}"
+    )
+    assert workspace.command_for("verified matches") == (
+        f"corrsfm prune '{workspace.root}' --method ratio --model 'a b.pth' --min-num-inliers 20"
+    )
+    assert workspace.command_for("models") == f"corrsfm reconstruct '{workspace.root}'"
+
+
+@pytest.mark.parametrize("stage", STAGE_COMMANDS)
+def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspace, stage: str) -> None:
+    others: dict[type, object] = {bool: True, int: 99, float: 0.5, str: "f,x,y"}
+    num_flags = 0
+    for name, options in (
+        ("images", cfg.ImagesConfig), ("features", cfg.FeaturesConfig), ("pairs", cfg.PairsConfig),
+        ("matches", cfg.MatchesConfig), ("pruned matches", cfg.PruneConfig),
+        ("verified matches", cfg.DatabaseConfig), ("models", cfg.ReconstructionConfig),
+    ):  # fmt: skip
+        changed = {}
+        for key, value in cfg.to_dict(options()).items():
+            changed[key] = others.get(type(value), "x") if not isinstance(value, str | list) else value
+            if isinstance(value, bool):
+                changed[key] = not value
+            num_flags += changed[key] != value
+        workspace.finish(name, StageRecord(fingerprint="f", config=changed))
+    assert num_flags > 20
+    _, command, *words = shlex.split(workspace.command_for(stage))
+    main.commands[command].make_context(command, words)
+
+
+def test_a_folder_that_is_no_workspace_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="not a corrsfm workspace; make one with: corrsfm extract"):
+        Workspace(tmp_path)
+
+
+def test_a_folder_with_another_tools_database_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "database.db").write_bytes(b"precious")
+    with pytest.raises(WorkspaceError, match=r"database\.db of another tool"):
+        Workspace(tmp_path, create=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
+
+
+def test_a_workspace_without_its_manifest_goes_on(workspace: Workspace) -> None:
+    for path in (workspace.images_json, workspace.database):
+        path.touch()
+    workspace.manifest.write_text("{")
+    with pytest.raises(WorkspaceError, match="delete this file alone and run"):
+        Workspace(workspace.root, create=True)
+    workspace.manifest.unlink()
+    assert Workspace(workspace.root, create=True).record_of("images") is None
+    assert workspace.database.exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "scene").touch()
+    with pytest.raises(WorkspaceError, match="is a file"):
+        Workspace(tmp_path / "scene", create=True)
+
+
+def test_another_format_version_is_refused(workspace: Workspace) -> None:
+    workspace.manifest.write_text(json.dumps({"format_version": 99, "stages": {}}))
+    with pytest.raises(WorkspaceError, match="format version 99"):
+        Workspace(workspace.root)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "{", "[]", "{}", '{"format_version": 1}',
+        '{"format_version": 1, "images_dir": null, "stages": []}',
+        '{"format_version": 1, "images_dir": null, "stages": {"models": {"colour": 1}}}',
+    ],
+)  # fmt: skip
+def test_a_damaged_manifest_is_refused(workspace: Workspace, text: str) -> None:
+    workspace.manifest.write_text(text)
+    with pytest.raises(WorkspaceError, match="damaged"):
+        Workspace(workspace.root)
+
+
+def test_a_second_process_cannot_lock_a_workspace(workspace: Workspace) -> None:
+    code = (
+        "import sys; from pathlib import Path; from corrsfm.workspace import Workspace\n"
+        "from corrsfm.errors import WorkspaceError\n"
+        "try:\n"
+        "    with Workspace(Path(sys.argv[1])).lock(): print('locked')\n"
+        "except WorkspaceError as error: print(error)\n"
+    )
+    command = [sys.executable, "-c", code, str(workspace.root)]
+    with workspace.lock():
+        output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        assert "another corrsfm works in this workspace" in output
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "locked\n"
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
+def test_a_file_system_without_locks_is_used_with_a_warning(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with workspace.lock():
+        assert "this file system has no locks" in caplog.text
+
+
+def test_a_failing_lock_is_not_taken_for_another_process(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*arguments: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(WorkspaceError, match=r"cannot be locked \(Input/output error\)"), workspace.lock():
+        pass
+
+
+def test_a_workspace_that_cannot_be_written_is_refused(workspace: Workspace) -> None:
+    # Stands for a file system that is mounted read-only: tests may run as root, who may write anywhere.
+    (workspace.root / ".lock").mkdir()
+    with pytest.raises(WorkspaceError, match="nothing can be written there.*copy"), workspace.lock():
+        pass
+
+
+def test_models_put_aside_take_their_reports_along(workspace: Workspace) -> None:
+    def make(content: str) -> None:
+        workspace.finish("models", StageRecord(fingerprint="f"))
+        (workspace.sparse / "0").mkdir(parents=True)
+        workspace.run_json.write_text(content)
+
+    make("first")
+    workspace.report_html.write_text("first")
+    workspace.put_models_aside()
+    aside = workspace.root / "sparse.old"
+    assert workspace.record_of("models") is None
+    assert not workspace.sparse.exists() and not workspace.run_json.exists()
+    assert sorted(path.name for path in aside.iterdir()) == ["0", "report.html", "run.json"]
+    workspace.put_models_aside()
+    assert (aside / "run.json").read_text() == "first"
+    make("second")
+    workspace.put_models_aside()
+    assert sorted(path.name for path in aside.iterdir()) == ["0", "run.json"]
+    assert (aside / "run.json").read_text() == "second"
+
+
+def test_the_folder_of_the_photos_is_no_workspace_and_stays_as_it_is(tmp_path: Path) -> None:
+    with pytest.raises(WorkspaceError, match="is the folder of the photos; choose another"):
+        Workspace(tmp_path, create=True, images_dir=tmp_path / "." / "sub" / "..")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "images").mkdir()
+    assert Workspace(tmp_path, create=True, images_dir=tmp_path / "images").root == tmp_path
+
+
+def test_a_failed_mapping_is_remembered_until_the_matches_change_or_it_succeeds(workspace: Workspace) -> None:
+    workspace.finish("verified matches", StageRecord(fingerprint="first"))
+    assert not workspace.mapping_failed
+    workspace.put_models_aside()
+    assert workspace.mapping_failed and Workspace(workspace.root).mapping_failed
+    workspace.finish("verified matches", StageRecord(fingerprint="second"))
+    assert not workspace.mapping_failed
+    workspace.put_models_aside()
+    workspace.finish("models", StageRecord(fingerprint="f"))
+    assert not workspace.mapping_failed
