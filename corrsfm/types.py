@@ -311,15 +311,12 @@ class VerifiedPair:
         Matches that were verified; 0 for a pair pruned to nothing.
     num_inliers : int
         Matches that agree with the two-view geometry.
-    configuration : str
-        COLMAP's name for the kind of geometry, ``UNDEFINED`` if there is none.
     """
 
     name0: str
     name1: str
     num_matches: int
     num_inliers: int
-    configuration: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -331,8 +328,8 @@ class PairStatistics:
     name0, name1 : str
     num_putative : int
         Matches of the descriptors.
-    num_pruned : int
-        Matches that pruning kept.
+    num_kept : int
+        Matches that passed pruning.
     num_verified : int
         Kept matches that agree with the verified two-view geometry.
     """
@@ -340,7 +337,7 @@ class PairStatistics:
     name0: str
     name1: str
     num_putative: int
-    num_pruned: int
+    num_kept: int
     num_verified: int
 
 

@@ -44,10 +44,6 @@ def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[Verified
         verified = []
         for pair_id in {**num_matches, **num_inliers}:
             id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
-            configuration = "UNDEFINED"
-            if database.exists_two_view_geometry(id0, id1):
-                geometry = database.read_two_view_geometry(id0, id1)
-                configuration = pycolmap.TwoViewGeometryConfiguration(geometry.config).name
             name0, name1 = sorted((names[id0], names[id1]))
             verified.append(
                 VerifiedPair(
@@ -55,7 +51,6 @@ def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[Verified
                     name1=name1,
                     num_matches=num_matches.get(pair_id, 0),
                     num_inliers=num_inliers.get(pair_id, 0),
-                    configuration=configuration,
                 )
             )
     return sorted(verified, key=lambda pair: (pair.name0, pair.name1))

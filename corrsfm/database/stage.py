@@ -25,7 +25,7 @@ logger = logging.getLogger("corrsfm")
 def verify_matches(
     workspace: Workspace, config: cfg.DatabaseConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
-    """Write the COLMAP database and verify the pruned matches geometrically."""
+    """Write the COLMAP database and verify the kept matches geometrically."""
     started = time.monotonic()
     index = read_index(workspace)
     pruned = workspace.require("pruned matches")
@@ -35,7 +35,7 @@ def verify_matches(
     pair_list = read_pairs(workspace)
     damaged = workspace.database.is_file() and is_truncated(workspace.database)
     if damaged:
-        logger.warning("%s: damaged, its end is missing; it is written anew", workspace.database)
+        logger.warning("%s: damaged, its end is missing; it is written again", workspace.database)
     current = workspace.is_current("verified matches", fingerprint, workspace.database)
     if current and not overwrite and not damaged:
         return StageOutcome(
@@ -53,7 +53,7 @@ def verify_matches(
             images=index.records,
             cameras=index.cameras,
             features=read_features,
-            pruned=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
+            kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
             config=config,
             seed=run.seed,
             num_threads=count_threads(run.threads),

@@ -1,20 +1,20 @@
-"""Features and pruned matches → a COLMAP database with verified two-view geometries.
+"""Features and kept matches → a COLMAP database with verified two-view geometries.
 
 Everything goes through pycolmap's API, so the schema is always the one that pycolmap expects. Verification
 is `pycolmap.geometric_verification`, which estimates geometries from the matches that are there; its
-neighbour `verify_matches` would match the descriptors of pruned-away pairs again.
+neighbour `verify_matches` would match the descriptors of pairs again whose matches were dropped.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import to_pycolmap
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import database_errors, is_sqlite
 from corrsfm.config import DatabaseConfig
@@ -23,36 +23,7 @@ from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord
 
-__all__ = ["DatabaseSummary", "write_database"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatabaseSummary:
-    """What a database holds.
-
-    Attributes
-    ----------
-    num_images, num_keypoints : int
-    num_pairs : int
-        Pairs on record, those pruned to nothing included.
-    num_empty_pairs : int
-        Pairs pruned to nothing.
-    num_matches : int
-        Matches over all pairs.
-    num_duplicates : int
-        Repeated matches that were left out.
-    num_verified_pairs, num_inliers : int
-        Pairs with a two-view geometry, and the matches that agree with it.
-    """
-
-    num_images: int
-    num_keypoints: int
-    num_pairs: int
-    num_empty_pairs: int
-    num_matches: int
-    num_duplicates: int
-    num_verified_pairs: int
-    num_inliers: int
+__all__ = ["write_database"]
 
 
 def write_database(
@@ -61,12 +32,12 @@ def write_database(
     images: Sequence[ImageRecord],
     cameras: Sequence[Camera],
     features: Callable[[str], Features],
-    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    kept: Iterable[tuple[str, str, NDArray[np.int32]]],
     config: DatabaseConfig,
     seed: int = 0,
     num_threads: int = 0,
     log_file: Path | None = None,
-) -> DatabaseSummary:
+) -> None:
     """Write and verify a database; it appears at ``path`` whole or not at all.
 
     Parameters
@@ -79,7 +50,7 @@ def write_database(
         What the images' ``camera_id`` points into.
     features : callable
         Image name → `Features`; called once an image.
-    pruned : iterable of (str, str, (K, 2) int32)
+    kept : iterable of (str, str, (K, 2) int32)
         Two image names and the indices of the kept matches; K may be 0, and the pair stays on record.
     config : DatabaseConfig
     seed : int
@@ -101,26 +72,10 @@ def write_database(
         for suffix in ("-wal", "-shm"):
             temporary.with_name(temporary.name + suffix).unlink(missing_ok=True)
         with colmap_log(), database_errors(temporary, path):
-            num_duplicates, num_empty = _fill(
-                temporary, images, cameras, features, pruned, config.write_descriptors
-            )
+            _fill(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
             max_error_px = config.verification_error_px or default_verification_error_px(cameras)
             verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
-        with colmap_log(), database_errors(temporary, path), pycolmap.Database.open(temporary) as database:
-            # A pair whose verification failed has a row without inliers.
-            _, num_inliers = database.read_two_view_geometry_num_inliers()
-            summary = DatabaseSummary(
-                num_images=database.num_images(),
-                num_keypoints=database.num_keypoints(),
-                num_pairs=database.num_matched_image_pairs(),
-                num_empty_pairs=num_empty,
-                num_matches=database.num_matches(),
-                num_duplicates=num_duplicates,
-                num_verified_pairs=sum(num > 0 for num in num_inliers),
-                num_inliers=sum(num_inliers),
-            )
-    return summary
 
 
 def _check_not_in_use(path: Path) -> None:
@@ -148,10 +103,10 @@ def _fill(
     images: Sequence[ImageRecord],
     cameras: Sequence[Camera],
     features: Callable[[str], Features],
-    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
+    kept: Iterable[tuple[str, str, NDArray[np.int32]]],
     write_descriptors: bool,
-) -> tuple[int, int]:
-    """Write all tables but the geometries; numbers of repeated matches and of empty pairs."""
+) -> None:
+    """Write all tables but the geometries."""
     # COLMAP's verification reads the file through another connection, so it has to be closed before.
     with pycolmap.Database.open(path) as database:
         transaction = pycolmap.DatabaseTransaction(database)
@@ -165,7 +120,7 @@ def _fill(
                 _write_features(database, image_id, image.name, image_features, write_descriptors)
                 image_ids[image.name] = image_id
                 num_keypoints[image.name] = len(image_features)
-            return _write_pairs(database, image_ids, num_keypoints, pruned)
+            _write_pairs(database, image_ids, num_keypoints, kept)
         finally:
             # The transaction ends when its object goes; the database must be open then.
             del transaction
@@ -173,10 +128,7 @@ def _fill(
 
 def _write_camera(database: pycolmap.Database, camera: Camera) -> int:
     """Write a camera and the rig that COLMAP wants around it; its id."""
-    written = pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
-    written.has_prior_focal_length = camera.has_prior_focal_length
+    written = to_pycolmap(camera)
     written.camera_id = database.write_camera(written)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(written.sensor_id)
@@ -221,19 +173,15 @@ def _write_pairs(
     database: pycolmap.Database,
     image_ids: dict[str, int],
     num_keypoints: dict[str, int],
-    pruned: Iterable[tuple[str, str, NDArray[np.int32]]],
-) -> tuple[int, int]:
-    """Write the matches of all pairs; numbers of repeated matches and of empty pairs."""
-    num_duplicates = num_empty = 0
-    for name0, name1, indices in pruned:
+    kept: Iterable[tuple[str, str, NDArray[np.int32]]],
+) -> None:
+    """Write the matches of all pairs."""
+    for name0, name1, indices in kept:
         _check_pair(database, image_ids, num_keypoints, name0, name1, indices)
         # COLMAP would drop a repeated row later, with a warning for each.
         _, first = np.unique(indices, axis=0, return_index=True)
         unique = indices[np.sort(first)]
-        num_duplicates += len(indices) - len(unique)
-        num_empty += len(unique) == 0
         database.write_matches(image_ids[name0], image_ids[name1], unique.astype(np.uint32))
-    return num_duplicates, num_empty
 
 
 def _check_pair(

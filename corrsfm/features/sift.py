@@ -67,10 +67,10 @@ def extract_features(
     image: NDArray[np.uint8],
     mask: NDArray[np.bool_] | None = None,
     *,
-    extractor: Extractor = Extractor.OPENCV,
-    max_features: int = 4096,
-    max_image_size: int = 1600,
-    root_sift: bool = True,
+    extractor: Extractor = FeaturesConfig.extractor,
+    max_features: int = FeaturesConfig.max_features,
+    max_image_size: int = FeaturesConfig.max_image_size,
+    root_sift: bool = FeaturesConfig.root_sift,
 ) -> Features:
     """Detect and describe the strongest SIFT keypoints of a photo.
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from corrsfm.config import MatchesConfig
 from corrsfm.types import Matches
 
 __all__ = ["Matcher", "match_features"]
@@ -29,7 +30,7 @@ def match_features(
     descriptors0: NDArray[np.uint8],
     descriptors1: NDArray[np.uint8],
     *,
-    block_size: int = 4096,
+    block_size: int = MatchesConfig.block_size,
     device: str = "cpu",
 ) -> Matches:
     """Nearest neighbour in image 1 of every keypoint of image 0.
@@ -74,7 +75,7 @@ class Matcher:
         load: Callable[[str], NDArray[np.uint8]],
         *,
         device: str = "cpu",
-        block_size: int = 4096,
+        block_size: int = MatchesConfig.block_size,
         max_cached_images: int = 256,
     ) -> None:
         self._load = load

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.config import OperatingPoint, Precision
+from corrsfm.config import OperatingPoint, Precision, PruneConfig
 from corrsfm.errors import CorrsfmError
 from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
@@ -129,10 +129,10 @@ class Pruner:
         *,
         checkpoint_sha256: str = "in memory",
         device: str = "auto",
-        operating_point: OperatingPoint = OperatingPoint.SFM,
-        max_candidates: int = 2000,
-        max_batch_matches: int = 16_000,
-        precision: Precision = Precision.AUTO,
+        operating_point: OperatingPoint = PruneConfig.operating_point,
+        max_candidates: int = PruneConfig.max_candidates,
+        max_batch_matches: int = PruneConfig.max_batch_matches,
+        precision: Precision = PruneConfig.precision,
         threads: int = 0,
         batched: bool | None = None,
         compile: bool = False,

@@ -14,8 +14,8 @@
 Importing this package loads neither OpenCV nor pycolmap; `corrsfm.report.page` does.
 """
 
-from corrsfm.report.missing import MissingImage, MissingReason
+from corrsfm.report.missing import MissingPhoto, MissingReason
 from corrsfm.report.statistics import SceneReport, make_report
 from corrsfm.report.table import format_table
 
-__all__ = ["MissingImage", "MissingReason", "SceneReport", "format_table", "make_report"]
+__all__ = ["MissingPhoto", "MissingReason", "SceneReport", "format_table", "make_report"]

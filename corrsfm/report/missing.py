@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from corrsfm.types import ModelSummary, PairStatistics
 
-__all__ = ["MissingImage", "MissingReason", "missing_images"]
+__all__ = ["MissingPhoto", "MissingReason", "missing_photos"]
 
 
 class MissingReason(StrEnum):
@@ -26,7 +26,7 @@ class MissingReason(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
-class MissingImage:
+class MissingPhoto:
     """A photo that is not in the first model.
 
     Attributes
@@ -42,14 +42,14 @@ class MissingImage:
     detail: str
 
 
-def missing_images(
+def missing_photos(
     names: Sequence[str],
     pairs: Sequence[PairStatistics],
     components: Sequence[tuple[str, ...]],
     models: Sequence[ModelSummary],
     left_out: Collection[str],
     mapped: bool,
-) -> tuple[MissingImage, ...]:
+) -> tuple[MissingPhoto, ...]:
     pairs_of: dict[str, list[PairStatistics]] = {name: [] for name in names}
     for pair in pairs:
         pairs_of[pair.name0].append(pair)
@@ -78,7 +78,7 @@ def missing_images(
             reason, detail = MissingReason.NOT_MAPPED, _verified_pairs(name, pairs_of[name])
         else:
             reason, detail = _lost_at(name, pairs_of[name], component, main)
-        missing.append(MissingImage(name=name, reason=reason, detail=detail))
+        missing.append(MissingPhoto(name=name, reason=reason, detail=detail))
     return tuple(missing)
 
 
@@ -99,7 +99,7 @@ def _lost_at(
     among = f"{len(pairs)} pair" + ("s" if len(pairs) > 1 else "")
     if not any(pair.num_putative for pair in pairs):
         return MissingReason.NO_MATCH, f"no match in {among}; it may have no keypoints"
-    if not any(pair.num_pruned for pair in pairs):
+    if not any(pair.num_kept for pair in pairs):
         return (
             MissingReason.PRUNED,
             f"no match kept in {among}; most putative ones: {_best(name, pairs, 'num_putative')}",
@@ -107,7 +107,7 @@ def _lost_at(
     if not component:
         return (
             MissingReason.NOT_VERIFIED,
-            f"none of {among} verified; most kept: {_best(name, pairs, 'num_pruned')}",
+            f"none of {among} verified; most kept: {_best(name, pairs, 'num_kept')}",
         )
     if component != main:
         others = len(component) - 1

@@ -15,7 +15,7 @@ from corrsfm.colmap.models import observation_errors
 from corrsfm.errors import DependencyError
 from corrsfm.files import atomic_write_text
 from corrsfm.report import charts, pictures
-from corrsfm.report.missing import MissingImage
+from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.model_view import ModelView, make_view, plotly_view
 from corrsfm.report.statistics import SceneReport
 from corrsfm.report.style import STYLE
@@ -155,7 +155,7 @@ def _missing(report: SceneReport, images_dir: Path | None) -> str:
     )
 
 
-def _missing_row(image: MissingImage, images_dir: Path | None) -> str:
+def _missing_row(image: MissingPhoto, images_dir: Path | None) -> str:
     photo = pictures.read_photo(images_dir / image.name, _THUMBNAIL_SIZE) if images_dir else None
     thumbnail = f'<img src="{pictures.jpeg_uri(photo[0])}" alt="">' if photo is not None else ""
     return (
@@ -193,10 +193,10 @@ def _histograms(report: SceneReport, model: pycolmap.Reconstruction | None) -> s
         step = 0.05 * max(1, np.ceil(np.percentile(errors, 99) / 1.5))
         edges = np.round(step * np.arange(31), 2)
         drawn.append(charts.histogram(errors, edges, "reprojection error, px", "observations"))
-    ratios = [pair.num_verified / pair.num_pruned for pair in report.pairs if pair.num_pruned]
+    ratios = [pair.num_verified / pair.num_kept for pair in report.pairs if pair.num_kept]
     if ratios:
         edges = np.linspace(0, 1, 21)
-        drawn.append(charts.histogram(ratios, edges, "inlier ratio of pruned matches", "pairs"))
+        drawn.append(charts.histogram(ratios, edges, "inlier ratio of kept matches", "pairs"))
     if not drawn:
         return ""
     return '<div class="charts">' + "".join(f"<figure>{chart}</figure>" for chart in drawn) + "</div>"
@@ -237,10 +237,10 @@ def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMat
         return ""
     rows = "".join(
         f"<tr><td>{html.escape(pair.name0)}</td><td>{html.escape(pair.name1)}</td>"
-        f"<td>{pair.num_putative:,}</td><td>{pair.num_pruned:,}</td><td>{pair.num_verified:,}</td></tr>"
+        f"<td>{pair.num_putative:,}</td><td>{pair.num_kept:,}</td><td>{pair.num_verified:,}</td></tr>"
         for pair in listed
     )
-    head = "<tr><th>photo 0</th><th>photo 1</th><th>putative</th><th>pruned</th><th>verified</th></tr>"
+    head = "<tr><th>photo 0</th><th>photo 1</th><th>putative</th><th>kept</th><th>verified</th></tr>"
     count = f"All {len(report.pairs):,} pairs"
     if len(listed) < len(report.pairs):
         count = f"The best {len(listed):,} of {len(report.pairs):,} pairs; all are in report.json"
@@ -275,7 +275,7 @@ def _drawn_pair(kind: str, pair: PairStatistics, images_dir: Path, load_matches:
     return (
         f'<figure><img class="wide" src="{pictures.jpeg_uri(drawn)}" alt=""><figcaption>'
         f"<b>{kind}</b> {names}: {pair.num_putative:,} putative, "
-        f"{pair.num_pruned:,} pruned, {pair.num_verified:,} verified</figcaption></figure>"
+        f"{pair.num_kept:,} kept, {pair.num_verified:,} verified</figcaption></figure>"
     )
 
 

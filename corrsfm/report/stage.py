@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from corrsfm.report.statistics import SceneReport, make_report
 from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
+from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
 from corrsfm.workspace.lists import read_index, read_pairs
 from corrsfm.workspace.resume import photos_left_out, require_database
 from corrsfm.workspace.store import ItemStore
@@ -72,16 +71,11 @@ def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:
             name0=name0,
             name1=name1,
             num_putative=int(counts["num_putative"]),
-            num_pruned=_num_kept(pruned, (name0, name1), counts),
+            num_kept=int(counts["num_kept"]),
             num_verified=verified.get((min(name0, name1), max(name0, name1)), 0),
         )
         for (name0, name1), counts in pruned.attributes(read_pairs(workspace).pairs)
     ]
-
-
-def _num_kept(store: ItemStore[Pair, PrunedMatches], pair: Pair, counts: dict[str, Any]) -> int:
-    # Files of the first days hold no count.
-    return int(counts["num_kept"]) if "num_kept" in counts else len(store.read(pair).indices)
 
 
 def _points_of_matches(

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from corrsfm.report.missing import MissingImage, MissingReason, missing_images
+from corrsfm.graph import connected_components
+from corrsfm.report.missing import MissingPhoto, missing_photos
 from corrsfm.types import ModelSummary, PairStatistics
 
 __all__ = ["SceneReport", "make_report"]
@@ -34,7 +35,7 @@ class SceneReport:
     components : tuple of tuple of str
         Connected components of the graph of verified pairs, the largest first; photos without a verified
         pair are not part of any.
-    missing : tuple of MissingImage
+    missing : tuple of MissingPhoto
         Photos that are not registered, sorted by name.
     stage_seconds : dict
         Stage → seconds of wall clock it took when it was last run, in the order of the stages.
@@ -49,7 +50,7 @@ class SceneReport:
     models: tuple[ModelSummary, ...]
     pairs: tuple[PairStatistics, ...]
     components: tuple[tuple[str, ...], ...]
-    missing: tuple[MissingImage, ...]
+    missing: tuple[MissingPhoto, ...]
     stage_seconds: dict[str, float]
     configuration: dict[str, Any]
     versions: dict[str, str]
@@ -77,20 +78,20 @@ class SceneReport:
     @property
     def num_empty_pairs(self) -> int:
         """Pairs pruned to nothing."""
-        return sum(pair.num_pruned == 0 for pair in self.pairs)
+        return sum(pair.num_kept == 0 for pair in self.pairs)
 
     @property
     def num_matches(self) -> tuple[int, int, int]:
-        """Putative, pruned and verified matches over all pairs."""
+        """Putative, kept and verified matches over all pairs."""
         return (
             sum(pair.num_putative for pair in self.pairs),
-            sum(pair.num_pruned for pair in self.pairs),
+            sum(pair.num_kept for pair in self.pairs),
             sum(pair.num_verified for pair in self.pairs),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON: a ``summary`` to read first, then everything; undefined numbers are null."""
-        putative, pruned, verified = self.num_matches
+        putative, kept, verified = self.num_matches
         largest = self.models[0] if self.models else None
         values = {
             "format_version": FORMAT_VERSION,
@@ -112,44 +113,19 @@ class SceneReport:
                 "num_empty_pairs": self.num_empty_pairs,
                 "num_verified_pairs": self.num_verified_pairs,
                 "num_putative_matches": putative,
-                "num_pruned_matches": pruned,
+                "num_kept_matches": kept,
+                # The old name of what was kept; goes with the next version.
+                "num_pruned_matches": kept,
                 "num_verified_matches": verified,
                 "num_components": len(self.components),
                 "seconds": sum(self.stage_seconds.values()),
             },
             **{entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)},
         }
-        return _plain(values)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> SceneReport:
-        """The report that `to_dict` was called on.
-
-        Raises
-        ------
-        ValueError
-            If the values are of another format version.
-        """
-        if values.get("format_version") != FORMAT_VERSION:
-            raise ValueError(
-                f"report of format {values.get('format_version')}, this version reads {FORMAT_VERSION}"
-            )
-        return cls(
-            scene=values["scene"],
-            image_names=tuple(values["image_names"]),
-            models=tuple(_model_from_dict(model) for model in values["models"]),
-            pairs=tuple(PairStatistics(**pair) for pair in values["pairs"]),
-            components=tuple(tuple(component) for component in values["components"]),
-            missing=tuple(
-                MissingImage(
-                    name=image["name"], reason=MissingReason(image["reason"]), detail=image["detail"]
-                )
-                for image in values["missing"]
-            ),
-            stage_seconds=dict(values["stage_seconds"]),
-            configuration=dict(values["configuration"]),
-            versions=dict(values["versions"]),
-        )
+        plain: dict[str, Any] = _plain(values)
+        for pair in plain["pairs"]:
+            pair["num_pruned"] = pair["num_kept"]  # the old name, as above
+        return plain
 
 
 def make_report(
@@ -189,37 +165,20 @@ def make_report(
     """
     names = tuple(sorted(image_names))
     pairs = tuple(sorted(pairs, key=lambda pair: (pair.name0, pair.name1)))
-    components = _components(pairs)
+    verified = [(pair.name0, pair.name1) for pair in pairs if pair.num_verified > 0]
+    paired = sorted({name for pair in verified for name in pair})
+    components = tuple(tuple(component) for component in connected_components(paired, verified))
     return SceneReport(
         scene=scene,
         image_names=names,
         models=tuple(models),
         pairs=pairs,
         components=components,
-        missing=missing_images(names, pairs, components, models, left_out, mapped),
+        missing=missing_photos(names, pairs, components, models, left_out, mapped),
         stage_seconds=dict(stage_seconds or {}),
         configuration=dict(configuration or {}),
         versions=dict(versions or {}),
     )
-
-
-def _components(pairs: Iterable[PairStatistics]) -> tuple[tuple[str, ...], ...]:
-    """Connected components of the verified pairs, the largest first, equal sizes in order of names."""
-    parent: dict[str, str] = {}
-
-    def root(name: str) -> str:
-        while parent.setdefault(name, name) != name:
-            parent[name] = parent[parent[name]]
-            name = parent[name]
-        return name
-
-    for pair in pairs:
-        if pair.num_verified > 0:
-            parent[root(pair.name0)] = root(pair.name1)
-    members: dict[str, list[str]] = {}
-    for name in sorted(parent):
-        members.setdefault(root(name), []).append(name)
-    return tuple(sorted(map(tuple, members.values()), key=lambda names: (-len(names), names)))
 
 
 def _plain(value: Any) -> Any:
@@ -233,8 +192,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, StrEnum) else value
-
-
-def _model_from_dict(values: Mapping[str, Any]) -> ModelSummary:
-    floats = {key: math.nan if value is None else value for key, value in values.items()}
-    return ModelSummary(**(floats | {"image_names": tuple(values["image_names"])}))

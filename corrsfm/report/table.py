@@ -60,7 +60,7 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
                 f"{model.p95_error_px:.2f} 95th percentile",
             ),
         ]
-    putative, pruned, verified = report.num_matches
+    putative, kept, verified = report.num_matches
     share = 100.0 / max(putative, 1)
     rows += [
         (
@@ -70,7 +70,7 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
         ),
         (
             "matches",
-            f"{putative:,} putative → {pruned:,} pruned ({share * pruned:.1f} %) "
+            f"{putative:,} putative → {kept:,} kept ({share * kept:.1f} %) "
             f"→ {verified:,} verified ({share * verified:.1f} %)",
         ),
         ("view graph", _components(report)),

@@ -57,7 +57,7 @@ def matches(model: pycolmap.Reconstruction):
 def report_of(model: pycolmap.Reconstruction, **changes):
     photos = names(model)
     pairs = [
-        PairStatistics(name0=a, name1=b, num_putative=80, num_pruned=40, num_verified=39 - 5 * i - j)
+        PairStatistics(name0=a, name1=b, num_putative=80, num_kept=40, num_verified=39 - 5 * i - j)
         for i, a in enumerate(photos)
         for j, b in enumerate(photos)
         if a < b
@@ -173,9 +173,7 @@ def test_no_match_at_all_can_be_drawn() -> None:
 
 def test_view_graph_is_white_grey_or_darker_with_more_matches() -> None:
     def pair(name0: str, name1: str, verified: int) -> PairStatistics:
-        return PairStatistics(
-            name0=name0, name1=name1, num_putative=900, num_pruned=500, num_verified=verified
-        )
+        return PairStatistics(name0=name0, name1=name1, num_putative=900, num_kept=500, num_verified=verified)
 
     pairs = [pair("a", "b", 20), pair("a", "c", 100), pair("d", "b", 400), pair("c", "d", 0)]
     picture = draw_view_graph("abcd", pairs)
@@ -193,7 +191,7 @@ def test_view_graph_is_white_grey_or_darker_with_more_matches() -> None:
 
 def test_view_graph_of_many_photos_stays_small() -> None:
     many = [f"{index:04d}" for index in range(1200)]
-    pairs = [PairStatistics(name0=many[0], name1=many[-1], num_putative=9, num_pruned=9, num_verified=9)]
+    pairs = [PairStatistics(name0=many[0], name1=many[-1], num_putative=9, num_kept=9, num_verified=9)]
     picture = draw_view_graph(many, pairs)
     assert picture.shape == (500, 500, 3)
     assert (picture[0, -1] != 255).any()

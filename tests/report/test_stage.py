@@ -76,5 +76,5 @@ def test_counts_of_a_pair_are_those_of_its_matches(workspace: Workspace) -> None
     assert [(pair.name0, pair.name1) for pair in pairs] == sorted(read_pairs(workspace).pairs)
     for pair in pairs:
         key = (pair.name0, pair.name1)
-        assert pair.num_putative == len(matches.read(key)) > pair.num_pruned
-        assert pair.num_pruned == len(pruned.read(key).indices) > 0
+        assert pair.num_putative == len(matches.read(key)) > pair.num_kept
+        assert pair.num_kept == len(pruned.read(key).indices) > 0
