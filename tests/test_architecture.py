@@ -29,11 +29,13 @@ FLOORS: list[tuple[str, set[str]]] = [
 FLOOR = {room: number for number, (_, rooms) in enumerate(FLOORS) for room in rooms}
 # On one floor only these imports are allowed: importer → imported, with the reason.
 ON_ONE_FLOOR: dict[tuple[str, str], str] = {
+    ("types", "errors"): "a camera that is not possible says so",
     ("files", "errors"): "a file that cannot be read says so",
     ("machine", "errors"): "a device that cannot be used says so",
     ("graph", "errors"): "long lists of names are cut in one place",
     ("graph", "types"): "a pair is two names",
     ("workspace", "colmap"): "a stage asks whether the database it starts from is whole",
+    ("report", "images"): "photos are decoded in one place, images/photos.py",
     ("training", "evaluation"): "training is judged by evaluation's metrics",
     ("__main__", "cli"): "python -m corrsfm",
 }

@@ -1,6 +1,6 @@
-"""How corrsfm talks to pycolmap: a quiet log, failures in plain words, and models in numbers.
+"""pycolmap's log: quiet on the terminal, kept in a file.
 
-pycolmap's log is one per process (glog), so `colmap_log` is not for use from several threads at once.
+The log is one per process (glog), so `colmap_log` is not for use from several threads at once.
 """
 
 from __future__ import annotations
@@ -14,11 +14,6 @@ from pathlib import Path
 import pycolmap
 
 __all__ = ["colmap_log", "pycolmap_version"]
-
-# Importing pycolmap makes SIGTERM print a stack trace of native code, as if something had crashed; this gives
-# the signal back the meaning that it had. Only the main thread may.
-with contextlib.suppress(ValueError):
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 _SILENT = 3
 
@@ -38,6 +33,7 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
         The messages are appended to it when the block ends, also when it fails. Without it they are dropped;
         pycolmap's own default would be the terminal and files in the temporary folder of the machine.
     """
+    _give_back_termination()
     log = pycolmap.logging
     before = (log.minloglevel, log.alsologtostderr, log.logtostderr)
     log.alsologtostderr = log.logtostderr = False
@@ -59,6 +55,16 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
                     _append(sorted(Path(folder).iterdir()), log_file)
     finally:
         log.minloglevel, log.alsologtostderr, log.logtostderr = before
+
+
+def _give_back_termination() -> None:
+    """Undo what importing pycolmap does to SIGTERM.
+
+    It prints a stack trace of native code, as if something had crashed. The handler that Python knows of is
+    set again; only the main thread may.
+    """
+    with contextlib.suppress(ValueError):
+        signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 
 def _append(sources: list[Path], target: Path) -> None:

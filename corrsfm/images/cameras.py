@@ -14,7 +14,7 @@ import numpy as np
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.config import CameraMode
 from corrsfm.errors import ConfigError, InputError, first_few
-from corrsfm.types import Camera
+from corrsfm.types import CAMERA_PARAMETERS, Camera
 
 if TYPE_CHECKING:
     pass
@@ -173,14 +173,12 @@ def _make_camera(infos: Sequence[PhotoInfo], model: str, values: list[float]) ->
 
 def _parse_params(model: str, params: str) -> list[float]:
     """The known intrinsics as numbers; checks the model on the way."""
-    import pycolmap
-
-    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
-    if model not in known:
-        raise ConfigError(f"camera_model is '{model}', expected one of {', '.join(known)}")
+    if model not in CAMERA_PARAMETERS:
+        known = ", ".join(sorted(CAMERA_PARAMETERS))
+        raise ConfigError(f"camera_model is '{model}', expected one of {known}")
     if not params.strip():
         return []
-    expected = pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params_info
+    expected = CAMERA_PARAMETERS[model].replace(" ", ", ")
     try:
         values = [float(value) for value in params.split(",")]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Photos: their index, pixels and masks, cameras and positions from EXIF.
+"""Photos as files: their pixels, their masks, and what EXIF says of camera and position.
 
 Photos are read as stored: an EXIF orientation is not applied, because COLMAP does not either and camera,
 mask and keypoints must speak of the same frame.
@@ -6,7 +6,6 @@ mask and keypoints must speak of the same frame.
 
 from __future__ import annotations
 
-import logging
 import math
 from pathlib import Path
 
@@ -17,9 +16,7 @@ from numpy.typing import NDArray
 from corrsfm.errors import ImageError
 from corrsfm.images.cameras import PhotoInfo
 
-__all__ = ["read_image", "read_mask", "read_photo_info"]
-
-logger = logging.getLogger("corrsfm")
+__all__ = ["read_colour", "read_image", "read_mask", "read_photo_info"]
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -75,17 +72,35 @@ def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return mask > 0
 
 
-def _decode(path: Path, advice: str) -> NDArray:
-    """(H, W) grey values in the depth of the file; reads bytes first, for names of any alphabet."""
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """Read a photo in colour, in the orientation in which it is stored.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        OpenCV's order of channels, blue first.
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read or decoded.
+    """
+    return np.asarray(_decode(path, "re-export or remove the photo", cv2.IMREAD_COLOR), np.uint8)
+
+
+def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) -> NDArray:
+    """(H, W) grey values in the depth of the file, or (H, W, 3) in colour.
+
+    Reads the bytes first, because OpenCV's own reader does not open names of every alphabet.
+    """
     try:
         content = np.fromfile(path, np.uint8)
     except OSError as error:
         raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     if len(content) == 0:
         raise ImageError(f"{path}: the file is empty; {advice}")
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        image = cv2.imdecode(content, flags)
+        image = cv2.imdecode(content, kind | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
         raise ImageError(f"{path}: cannot be decoded ({error.err}); {advice}") from error
     if image is None:

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from corrsfm import config as cfg
+from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.images.cache import PhotoCache
@@ -43,9 +44,14 @@ def index_photos(
     if images_dir.is_dir() and not overwrite:
         _refuse_vanished_photos(workspace, images_dir)
     cache = PhotoCache(workspace.photo_cache)
-    records, cameras = index_images(
-        images_dir, config, threads=count_threads(run.threads), hash_of=cache.hash_of, info_of=cache.info_of
-    )
+    with colmap_log(workspace.log):
+        records, cameras = index_images(
+            images_dir,
+            config,
+            threads=count_threads(run.threads),
+            hash_of=cache.hash_of,
+            info_of=cache.info_of,
+        )
     cache.save()
     check_hloc_keys(record.name for record in records)
     for remark in name_remarks([record.name for record in records]):

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.errors import ImageError
+from corrsfm.images.photos import read_colour
 from corrsfm.types import PairStatistics
 
 __all__ = [
@@ -39,7 +41,7 @@ def _bgr(colour: str) -> tuple[int, int, int]:
 
 
 def read_photo(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float] | None:
-    """Read a photo as it is stored, EXIF orientation ignored like everywhere, and scale it down.
+    """Read a photo and scale it down.
 
     Returns
     -------
@@ -50,13 +52,8 @@ def read_photo(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float] | N
     None if there is no such photo or it cannot be read: a page goes without it.
     """
     try:
-        encoded = np.fromfile(path, np.uint8)
-    except OSError:
-        return None
-    if not len(encoded):
-        return None
-    photo = cv2.imdecode(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if photo is None:
+        photo = read_colour(path)
+    except ImageError:
         return None
     scale = min(1.0, max_size / max(photo.shape[:2]))
     size = (max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale)))

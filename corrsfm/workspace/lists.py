@@ -11,7 +11,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_write_json, atomic_write_text
 from corrsfm.types import Camera, ImageRecord, PairList
 from corrsfm.workspace.folder import Workspace
@@ -78,9 +78,9 @@ def read_index(workspace: Workspace) -> Index:
         raise WorkspaceError(
             f"{path}: missing; index the photos with: {workspace.command_for('images')}"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (InputError, OSError, ValueError, KeyError, TypeError) as error:
         raise WorkspaceError(
-            f"{path}: damaged ({error}); make it anew with: {workspace.command_for('images')}"
+            f"{path}: damaged ({error}); make it again with: {workspace.command_for('images')}"
         ) from error
     return Index(records=records, cameras=cameras)
 

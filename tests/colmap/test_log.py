@@ -13,7 +13,12 @@ from corrsfm.errors import DatabaseError
 
 
 def test_termination_is_quiet():
-    code = "import os, signal, corrsfm.colmap; os.kill(os.getpid(), signal.SIGTERM)"
+    code = (
+        "import os, signal\n"
+        "from corrsfm.colmap.log import colmap_log\n"
+        "with colmap_log():\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert done.returncode == -signal.SIGTERM
     assert done.stderr == b""

@@ -293,7 +293,8 @@ t.write(Path({str(tmp_path)!r}) / "database.db", killed())
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 9
     assert not (tmp_path / "database.db").exists()
     assert files(tmp_path), "the killed run should have left its unfinished file"
-    assert write(tmp_path / "database.db").num_pairs == 3
+    write(tmp_path / "database.db")
+    assert counts(tmp_path / "database.db")["pairs"] == 3
     assert files(tmp_path) == ["database.db"]
 
 
