@@ -1,7 +1,76 @@
-"""corrsfm: structure from motion with learned correspondence pruning."""
+"""corrsfm: structure from motion with learned correspondence pruning.
+
+The names below are the public interface; each is loaded when it is first used, so that importing the package
+costs nothing.
+
+::
+
+    run_scene(photos, workspace, PipelineConfig())      photos → models and a report
+    open_workspace(folder)                              read what the stages left there
+    Pruner.load()(pairs)                                prune matches of your own
+    correspondences_from_points(points0, points1, …)    such matches, from two arrays and two cameras
+    load_network(checkpoint)                            the network itself, tensors in and out
+"""
+
+from __future__ import annotations
+
+import importlib
 
 # pycolmap's wheel exports zlib symbols; unless the real zlib is loaded first, the first zlib compression
 # after `import pycolmap` aborts the process.
 import zlib  # noqa: F401
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from corrsfm.config import PipelineConfig
+    from corrsfm.model import load_network
+    from corrsfm.pipeline import run_scene
+    from corrsfm.prune.correspondences import correspondences_from_points
+    from corrsfm.prune.learned import Pruner
+    from corrsfm.types import Camera, Correspondences, Features, Matches, PruneResult
+    from corrsfm.workspace.scene import Scene, open_workspace
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "Camera",
+    "Correspondences",
+    "Features",
+    "Matches",
+    "PipelineConfig",
+    "PruneResult",
+    "Pruner",
+    "Scene",
+    "__version__",
+    "correspondences_from_points",
+    "load_network",
+    "open_workspace",
+    "run_scene",
+]
+
+_HOMES = {
+    "Camera": "types",
+    "Correspondences": "types",
+    "Features": "types",
+    "Matches": "types",
+    "PipelineConfig": "config",
+    "PruneResult": "types",
+    "Pruner": "prune.learned",
+    "Scene": "workspace.scene",
+    "correspondences_from_points": "prune.correspondences",
+    "load_network": "model",
+    "open_workspace": "workspace.scene",
+    "run_scene": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

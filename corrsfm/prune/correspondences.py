@@ -6,16 +6,20 @@ A part of the prune stage that training shares, so that a network is trained on 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from corrsfm.colmap.cameras import normalise_points
+from corrsfm.errors import InputError
 from corrsfm.geometry import wrap_angles
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
-__all__ = ["SIDE_CHANNELS", "make_correspondences", "side_information"]
+__all__ = ["SIDE_CHANNELS", "correspondences_from_points", "make_correspondences", "side_information"]
 
 SIDE_CHANNELS = {0: (), 2: ("ratio", "mutual"), 5: ("ratio", "mutual", "log_scale_ratio", "cos", "sin")}
 """Names of the side channels by their number, the layouts that networks may be made for."""
+
+UNKNOWN_RATIO = 0.8
+"""Descriptor distance ratio that stands in for one that is not known."""
 
 # Scales differ by e³ ≈ 20 between two photos at most; beyond is a broken keypoint.
 _MAX_LOG_SCALE_RATIO = 3.0
@@ -61,6 +65,78 @@ def make_correspondences(
         camera1=camera1,
         name=name,
     )
+
+
+def correspondences_from_points(
+    points0: ArrayLike,
+    points1: ArrayLike,
+    camera0: Camera | ArrayLike,
+    camera1: Camera | ArrayLike,
+    *,
+    ratios: ArrayLike | None = None,
+    mutual: ArrayLike | None = None,
+    name: str = "",
+) -> Correspondences:
+    """Putative matches of your own, of any detector, for a prune method.
+
+    What is not known of a match takes a neutral value: `UNKNOWN_RATIO`, mutual, no change of scale and no
+    rotation between the photos. The bundled network prunes less well for it.
+
+    Parameters
+    ----------
+    points0, points1 : (M, 2) array_like
+        Matched points in pixels, COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+    camera0, camera1 : Camera or (3, 3) array_like
+        Cameras, or intrinsic matrices of cameras without distortion.
+    ratios : (M,) array_like, optional
+        Distance to the nearest over distance to the second nearest descriptor, in [0, 1].
+    mutual : (M,) array_like of bool, optional
+        Whether a match is the nearest neighbour in both directions.
+    name : str
+        What to call the pair in messages.
+
+    Raises
+    ------
+    InputError
+        If a shape or value does not fit.
+    """
+    columns = [np.asarray(points, np.float32) for points in (points0, points1)]
+    num = len(columns[0]) if columns[0].ndim else 0
+    for label, points in zip(("points0", "points1"), columns, strict=True):
+        if points.shape != (num, 2):
+            raise InputError(f"{label} has shape {points.shape}, expected ({num}, 2): x and y in pixels")
+    known_ratios = np.full(num, UNKNOWN_RATIO) if ratios is None else np.asarray(ratios)
+    known_mutual = np.ones(num, bool) if mutual is None else np.asarray(mutual)
+    for label, values in (("ratios", known_ratios), ("mutual", known_mutual)):
+        if values.shape != (num,):
+            raise InputError(f"{label} has shape {values.shape}, expected ({num},): one entry a match")
+    # Also false for NaN.
+    if not ((known_ratios >= 0) & (known_ratios <= 1)).all():
+        raise InputError("ratios must be between 0 and 1: nearest over second nearest descriptor distance")
+    cameras = [
+        camera if isinstance(camera, Camera) else _pinhole(camera, points)
+        for camera, points in zip((camera0, camera1), columns, strict=True)
+    ]
+    rays = [normalise_points(camera, points) for camera, points in zip(cameras, columns, strict=True)]
+    return Correspondences(
+        points0=columns[0],
+        points1=columns[1],
+        normalised=np.hstack(rays, dtype=np.float32),
+        ratios=known_ratios.astype(np.float32),
+        mutual=known_mutual.astype(bool),
+        log_scale_ratios=np.zeros(num, np.float32),
+        rotations=np.zeros(num, np.float32),
+        camera0=cameras[0],
+        camera1=cameras[1],
+        name=name,
+    )
+
+
+def _pinhole(matrix: ArrayLike, points: NDArray[np.float32]) -> Camera:
+    """A camera of known intrinsics; its size, which only messages show, is what holds the points."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    width, height = np.ceil(finite.max(axis=0, initial=1.0)).astype(int)
+    return Camera.from_matrix(matrix, int(width), int(height))
 
 
 def side_information(correspondences: Correspondences, num_channels: int) -> NDArray[np.float32]:
