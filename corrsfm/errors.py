@@ -1,4 +1,4 @@
-"""Errors that speak to the user.
+"""Errors written for the user.
 
 Every error a user can cause derives from `CorrsfmError`; the command line catches that one class, prints
 its text and exits non-zero. A text names the file or the pair, what was expected and what to try.

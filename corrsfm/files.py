@@ -1,4 +1,4 @@
-"""Files: how they come into being whole, the hash of what they hold, and lists that people write."""
+"""Files written whole or not at all, their hashes, and lists that people write."""
 
 from __future__ import annotations
 
@@ -104,4 +104,4 @@ def read_lines(path: Path) -> list[str]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is no UTF-8 text ({error}); save it as UTF-8") from error
+        raise InputError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error

@@ -61,7 +61,7 @@ def find_device(name: str) -> str:
 
 
 def use_threads(num_threads: int) -> None:
-    """Let torch use so many threads for one operation."""
+    """Set how many threads torch uses for one operation."""
     import torch
 
     torch.set_num_threads(num_threads)

@@ -86,7 +86,9 @@ def test_a_workspace_is_read_photo_by_photo(repository: Path) -> None:
 
 
 def readme_example(repository: Path) -> str:
-    block = re.search(r"```python\n(.*?)```", (repository / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    block = re.search(
+        r"```python\n(.*?)```", (repository / "README.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     assert block is not None
     return block[1]
 
@@ -94,7 +96,7 @@ def readme_example(repository: Path) -> str:
 def test_the_readmes_python_keeps_inliers_and_drops_outliers(repository: Path) -> None:
     code = readme_example(repository)
     assert len(code.strip().splitlines()) <= 10
-    pair, right = make_pair(num=400, inlier_ratio=0.5)
+    pair = make_pair(seed=3, num=400, inlier_ratio=0.5).as_correspondences()
     names = {"points0": pair.points0, "points1": pair.points1, "ratios": pair.ratios, "camera": pair.camera0}
     exec(compile(code, "README.md", "exec"), names)
     kept = names["kept"]

@@ -534,7 +534,7 @@ def test_the_bar_of_mapping_starts_again_with_the_count(
     assert shown[-6:] == [2, 3, 4, "again", 2, 3]
 
 
-def test_a_truncated_database_is_written_anew(
+def test_a_truncated_database_is_written_again(
     workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     verify(workspace, photos)
@@ -548,7 +548,7 @@ def test_a_truncated_database_is_written_anew(
         with pytest.raises(WorkspaceError, match=r"damaged, its end is missing; run: corrsfm prune .* ratio"):
             stage()
     assert not pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
-    assert "database.db: damaged, its end is missing; it is written anew" in caplog.text
+    assert "database.db: damaged, its end is missing; it is written again" in caplog.text
     assert len(workspace.database.read_bytes()) == len(whole)
     assert pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
 
@@ -587,6 +587,6 @@ def test_verified_pairs_in_two_parts_are_told_before_mapping(
     verify(workspace, photos)
     pipeline.reconstruct(workspace, cfg.ReconstructionConfig(), RUN)
     assert (
-        "verified pairs fall into 2 components of 4, 3 photos: each becomes a model of its own" in caplog.text
+        "verified pairs fall into 2 components of 4, 3 photos: each becomes a separate model" in caplog.text
     )
     assert "not connected to the largest: other0.png, other1.png, other2.png" in caplog.text

@@ -95,7 +95,7 @@ def is_truncated(path: Path) -> bool:
     """Whether an SQLite database lacks bytes that its header promises; also so of an empty file.
 
     Quick whatever the size of the file, because only the header is read; what was damaged in its place is not
-    found. False for a file that is no SQLite database at all.
+    found. False for a file that is not an SQLite database.
     """
     size = path.stat().st_size
     with open(path, "rb") as file:
@@ -103,7 +103,7 @@ def is_truncated(path: Path) -> bool:
     if len(header) < _HEADER_BYTES:
         return _MAGIC.startswith(header[: len(_MAGIC)])
     page_size, num_pages = (int.from_bytes(header[start:end]) for start, end in ((16, 18), (28, 32)))
-    # The number of pages counts only if whoever wrote last wrote it, too.
+    # The page count is valid only if the last writer updated it.
     counted = header[24:28] == header[92:96]
     return (
         header.startswith(_MAGIC) and counted and size < num_pages * (65536 if page_size == 1 else page_size)

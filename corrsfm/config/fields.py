@@ -155,7 +155,7 @@ def _build(cls: type[T], values: dict[str, Any], prefix: str, problems: list[str
 
 
 def _expected_instead(entry: dataclasses.Field, value: Any) -> str:
-    """Which numbers an option takes if it does not take this one; empty if it does, or is no number."""
+    """Range of an option that a number falls outside of; empty if it fits or is not a number."""
     if type(value) not in (int, float):
         return ""
     minimum, above, maximum = (entry.metadata.get(key) for key in ("minimum", "above", "maximum"))

@@ -241,15 +241,15 @@ class ReconstructionConfig:
     multiple_models: bool = option(True, "Keep several models when the photos do not connect")
     refine_intrinsics: bool = option(
         True,
-        "Estimate focal lengths and distortion; without, those of --camera-params or EXIF stay as they are",
+        "Estimate focal lengths and distortion; otherwise those of --camera-params or EXIF are kept",
     )
     refine_principal_point: bool = option(False, "Also estimate the principal point")
     snapshot_every: int = option(
-        0, "Write a snapshot every so many registered photos; 0 for none", minimum=0, affects_result=False
+        0, "Registered photos between snapshots; 0 for none", minimum=0, affects_result=False
     )
     max_runtime_minutes: float = option(
         0.0,
-        "Stop mapping after so long and keep what there is; 0 for no limit",
+        "Stop mapping after this time and keep the models made so far; 0 for no limit",
         minimum=0,
         maximum=LARGEST_INT // 60,
     )

@@ -198,7 +198,7 @@ def _check_pair(
         if name not in image_ids:
             raise InputError(f"{pair}: {name} is not among the photos; make the pairs and matches again")
     if name0 == name1:
-        raise InputError(f"{pair}: a photo cannot be matched with itself; remove the pair from the list")
+        raise InputError(f"{pair}: a photo is paired with itself; remove the pair from the list")
     if indices.ndim != 2 or indices.shape[1] != 2 or indices.dtype.kind not in "iu":
         raise InputError(
             f"{pair}: matches are {indices.dtype} of shape {indices.shape}, expected integers (K, 2)"

@@ -11,7 +11,7 @@ ranking gave 29 % more matches on the true epipolar line than ranking by respons
 
 A place with several dominant gradient directions gives several keypoints that differ only in orientation and
 descriptor. That is SIFT as Lowe defines it and costs recall to forbid, so they are kept; two such places may
-match twice, and whoever counts distinct correspondences must compare coordinates, not indices.
+match twice, and to count distinct correspondences, compare coordinates, not indices.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = ["algorithm_of", "create_extractor", "extract_features", "quantise_des
 # OpenCV divides its threshold by the three layers of an octave. The value is far below its default of 0.04
 # so that photos of low texture reach `max_features` too; keeping the strongest does the selection.
 OPENCV_CONTRAST_THRESHOLD = 0.005
-# COLMAP's default. Lowering it is no help there: what is added competes by scale, not by strength.
+# COLMAP's default. Lowering it does not help: added keypoints compete by scale, not by strength.
 PYCOLMAP_PEAK_THRESHOLD = 0.02 / 3
 DESCRIPTOR_SIZE = 128
 FINEST_OCTAVE = 255  # OpenCV keeps the octave in the low byte; -1 is the doubled photo

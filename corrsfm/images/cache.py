@@ -1,4 +1,4 @@
-"""What photos said of themselves when they were last read, so that they are not read again."""
+"""Hashes and headers of photos, kept between runs so that unchanged files are not read again."""
 
 from __future__ import annotations
 

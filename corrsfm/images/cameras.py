@@ -83,7 +83,7 @@ def assign_cameras(
     Raises
     ------
     ConfigError
-        If the model is unknown or does not have that many parameters.
+        If the model is unknown or has another number of parameters.
     InputError
         If photos of one camera differ in size.
     """
@@ -128,14 +128,14 @@ def _has_exif(info: PhotoInfo) -> bool:
 
 
 def _suggest_sharing(infos: Sequence[PhotoInfo]) -> None:
-    """Say so if photos get a camera each that may well be of one camera."""
+    """Suggest sharing where photos of equal size get a camera each."""
     sizes = Counter((info.width, info.height) for info in infos if not _has_exif(info))
     num = sum(count for count in sizes.values() if count > 1)
     if not num:
         return
     of_one_size = len({(info.width, info.height) for info in infos}) == 1
     logger.info(
-        "%d photos of equal size tell no focal length and get a camera each; %s",
+        "%d photos of equal size have no focal length in EXIF and get a camera each; %s",
         num,
         "if one camera took them all, use --camera-mode single"
         if of_one_size

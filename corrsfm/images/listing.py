@@ -34,7 +34,7 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
         Text file with one name per line, relative to the folder; ``#`` starts a comment line. Only these
         photos are used, whatever their suffix.
     mask_dir : Path, optional
-        Folder of masks. If it lies inside the folder, what it holds is no photo; if it is the folder itself,
+        Folder of masks. If it lies inside the folder, nothing in it is a photo; if it is the folder itself,
         ``NAME.png`` beside a photo ``NAME`` is none. A list overrules this.
 
     Returns
@@ -108,7 +108,7 @@ def _warn_of_foreign(files: Sequence[str], names: Sequence[str]) -> None:
 
 
 def _without_masks(names: Sequence[str], folder: Path, mask_dir: Path) -> list[str]:
-    """The names that are no masks."""
+    """The names that are not masks."""
     masks, photos = mask_dir.resolve(), folder.resolve()
     if masks == photos:
         listed = set(names)

@@ -1,7 +1,7 @@
 """Photos as files: their pixels, their masks, and what EXIF says of camera and position.
 
 Photos are read as stored: an EXIF orientation is not applied, because COLMAP does not either and camera,
-mask and keypoints must speak of the same frame.
+mask and keypoints must use the same frame.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ def read_photo_info(path: Path) -> PhotoInfo:
 
     bitmap = pycolmap.Bitmap.read(path, False)
     if bitmap is None:
-        # A format that pycolmap does not know (WebP) or a file that cannot be read at all.
+        # pycolmap does not know the format (WebP), or the file is unreadable.
         height, width = read_image(path).shape
         return PhotoInfo(width=width, height=height)
     return PhotoInfo(

@@ -52,7 +52,7 @@ def make_pairs(
         return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
     explain(workspace, "pairs", config)
     with ItemStore(workspace.features, FEATURES).reader() as read:
-        # A list or a model may well name photos that were left out; that is no mistake.
+        # A list or a model may name photos that were left out.
         candidates = index.records if files else records
         pair_list = _without(
             left_out, strategies.make_pairs(candidates, config, load_features=read, seed=run.seed)
@@ -85,6 +85,6 @@ def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
 
 
 def _content(path: Path) -> str:
-    """Hash of what a file or all files of a folder hold; missing ones are reported by whoever reads them."""
+    """Hash of what a file or all files of a folder hold; what reads them reports missing ones."""
     files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
     return config_hash(*[[file.name, sha256_of(file)] for file in files if file.is_file()])

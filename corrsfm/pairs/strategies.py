@@ -287,7 +287,7 @@ def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:
 def _parse_pair(line: str, position: dict[str, int]) -> tuple[int, int] | None:
     candidates: list[Sequence[str]] = [[part.strip() for part in line.split("\t")], line.split()]
     if '"' in line or "'" in line:
-        with contextlib.suppress(ValueError):  # an apostrophe in a name is no quote
+        with contextlib.suppress(ValueError):  # an apostrophe in a name is not a quote
             candidates.append(shlex.split(line))
     text = line.strip()
     spaces = [match.span() for match in re.finditer(r"\s+", text)]

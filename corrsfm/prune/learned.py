@@ -32,7 +32,7 @@ _MIN_NUM_FOR_MATRIX = 8
 
 MIN_BFLOAT16_CHANNELS = 64
 
-# The guard speaks only about pairs that can show what they are.
+# Below these counts a pair says too little for the guard to judge it.
 _GUARD_MIN_MATCHES = 50
 _GUARD_RATIO = 0.8
 _GUARD_MIN_SHARE = 0.1

@@ -1,9 +1,9 @@
-"""Self-calibration: models whose focal lengths cannot be, and how to get better ones.
+"""Self-calibration: how to notice implausible focal lengths, and how to get better ones.
 
 A photo without EXIF starts from a guessed focal length, and mapping refines it from the first photos on. Few
 photos determine it badly: a focal length that runs away bends the model around it, and every later photo is
-registered to the bend. Registering with the guesses held, and refining all of them at the end, when many
-photos speak, avoids that.
+registered to the bend. Registering with the guesses held and refining them all at the end, with many
+photos to judge by, avoids that.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ __all__ = ["focal_length_ratios", "is_plausible", "refine_intrinsics"]
 
 # COLMAP gives up a photo beyond these while it maps, but not after the last bundle adjustment.
 _SMALLEST_RATIO, _LARGEST_RATIO = 0.1, 10.0
-# Zoom lenses and crops differ by as much; that many of them in one model are rarely an accident.
+# Zoom lenses and crops differ by as much, but rarely in so large a share of one model.
 _LARGEST_FACTOR, _LARGEST_SHARE = 2.0, 0.2
 
 _REFINEMENTS = 3

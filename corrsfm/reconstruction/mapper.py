@@ -113,7 +113,7 @@ def reconstruct(
 
 
 def _warn_of_unused(config: ReconstructionConfig) -> None:
-    """Say which options the chosen mapper does not heed."""
+    """Name the options that the chosen mapper ignores."""
     if config.mapper is not Mapper.GLOBAL:
         return
     for flag, value in (
@@ -129,7 +129,7 @@ def _cut_off(config: ReconstructionConfig, seconds: float) -> str:
     limit = _max_runtime_seconds(config)
     if config.mapper is Mapper.GLOBAL or not limit or seconds < limit:
         return ""
-    # Hierarchical mapping gives each of its parts so long.
+    # Hierarchical mapping applies the limit to each of its parts.
     stopped = "was stopped" if config.mapper is Mapper.INCREMENTAL else "may have been stopped"
     return f"mapping {stopped} after --max-runtime-minutes {config.max_runtime_minutes:g}"
 
@@ -175,7 +175,7 @@ def _run_mapper(
         largest = _largest(mapped.values())
         if largest is None or is_plausible(largest) or not config.refine_intrinsics:
             return mapped
-        logger.info("focal lengths that cannot be: mapping once more, with all of them held until the end")
+        logger.info("implausible focal lengths: mapping once more, with intrinsics held until the end")
         again = _map_with_held_intrinsics(database, images_dir, scratch, options, on_progress)
         return again if _explains_more(_largest(again.values()), largest) else mapped
     if config.mapper is Mapper.GLOBAL:

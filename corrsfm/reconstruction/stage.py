@@ -51,7 +51,7 @@ def reconstruct(
     if images_dir is None:
         fingerprint = black
         logger.warning(
-            "photos are no longer at %s; the points stay black; tell where they are now with: %s",
+            "photos are no longer at %s; the points stay black; if they moved, run: %s",
             workspace.images_dir,
             workspace.command_for("images", images_dir="NEWDIR"),
         )
@@ -93,7 +93,7 @@ def _warn_of_parts(workspace: Workspace, names: list[str]) -> None:
     ]
     if len(parts) > 1:
         logger.warning(
-            "verified pairs fall into %d components of %s photos: each becomes a model of its own at best; "
+            "verified pairs fall into %d components of %s photos: each becomes a separate model at best; "
             "add photos that bridge them, or try more features or more pairs\n"
             "not connected to the largest: %s",
             len(parts),

@@ -49,7 +49,7 @@ def read_photo(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float] | N
     scale : float
         Size of the result over size of the file, at most 1.
 
-    None if there is no such photo or it cannot be read: a page goes without it.
+    None if the photo is missing or unreadable; the page then leaves it out.
     """
     try:
         photo = read_colour(path)

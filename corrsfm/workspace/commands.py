@@ -10,7 +10,7 @@ from typing import Any
 from corrsfm import config as cfg
 from corrsfm.config.fields import flags_of
 
-__all__ = ["STAGE_COMMANDS", "command_for"]
+__all__ = ["STAGE_COMMANDS", "command_for", "label_of"]
 
 
 STAGE_COMMANDS = {
@@ -22,7 +22,10 @@ STAGE_COMMANDS = {
     "verified matches": "prune",
     "models": "reconstruct",
 }
-"""The stages, in order, and the command that makes each."""
+"""The stages, in order, and the command that makes each.
+
+The names are part of every fingerprint, so those of version 0.1.0 stay; `label_of` is what people read.
+"""
 
 
 _OPTIONS: dict[str, dict[str, type]] = {
@@ -37,6 +40,11 @@ _OPTIONS: dict[str, dict[str, type]] = {
     "prune": {"pruned matches": cfg.PruneConfig, "verified matches": cfg.DatabaseConfig},
     "reconstruct": {"models": cfg.ReconstructionConfig},
 }
+
+
+def label_of(stage: str) -> str:
+    """What to call a stage in a line for people."""
+    return "kept matches" if stage == "pruned matches" else stage
 
 
 def command_for(stage: str, root: Path, images_dir: str, recorded: Mapping[str, dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""A workspace: where every artefact lies, and what is finished.
+"""The folder of a workspace: where every file lies, and which stages are finished.
 
 ::
 
@@ -10,10 +10,10 @@
     ├── pairs.txt           pairs to match, ``name0 name1``
     ├── pair_origins.tsv    the strategies that proposed each pair
     ├── matches.h5          putative matches
-    ├── pruned.h5           pruned matches
+    ├── pruned.h5           matches that passed pruning
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
-    ├── sparse.old/         models of earlier matches, put aside when mapping failed
+    ├── sparse.old/         models of earlier matches, moved here when mapping failed
     ├── report.json, report.html
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
@@ -39,7 +39,7 @@ from typing import Any
 
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import atomic_write_json
-from corrsfm.workspace.commands import command_for
+from corrsfm.workspace.commands import command_for, label_of
 
 __all__ = ["StageRecord", "Workspace"]
 
@@ -240,11 +240,12 @@ class Workspace:
         """
         record = self.record_of(stage)
         if record is None:
-            raise WorkspaceError(f"{self.root}: no {stage} yet; run: {self.command_for(stage)}")
+            raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self.command_for(stage)}")
         for name, fingerprint in record.inputs.items():
             if self.require(name).fingerprint != fingerprint:
                 raise WorkspaceError(
-                    f"{self.root}: {stage} are older than {name}; run: {self.command_for(stage)}"
+                    f"{self.root}: {label_of(stage)} are older than {label_of(name)};"
+                    f" run: {self.command_for(stage)}"
                 )
         return record
 
@@ -296,7 +297,7 @@ class Workspace:
         """Remember that mapping failed, and move the models of earlier matches out of the way.
 
         They go to ``sparse.old``, with the reports about them, so that nobody takes them for new. What was
-        put aside before is replaced.
+        was moved there before is replaced.
         """
         self.forget("models")
         if verified := self.record_of("verified matches"):
@@ -312,12 +313,12 @@ class Workspace:
         if aside.exists():
             shutil.rmtree(aside)
         os.replace(self.sparse, aside)
-        logger.warning("the models of the earlier matches were put aside: %s", aside)
+        logger.warning("the models of the earlier matches were moved to %s", aside)
 
 
 def _check_manifest(values: dict[str, Any]) -> None:
     """Raise now what a damaged manifest would raise later."""
     if not isinstance(values["images_dir"], str | None):
-        raise TypeError("images_dir is no text")
+        raise TypeError("images_dir is not text")
     for record in values["stages"].values():
         StageRecord(**record)

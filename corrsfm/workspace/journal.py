@@ -1,7 +1,7 @@
 """A journal of finished items that survives a kill: an SQLite file, one transaction an item.
 
 An HDF5 file that is killed while being written is lost as a whole, so items wait here until the HDF5 file of
-their stage is written in one go. A killed process loses at most the item in work.
+their stage is written in one go. A killed process loses at most the item it was writing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Journal:
     def _connect(self) -> sqlite3.Connection:
         if self._connection is None:
             self._connection = sqlite3.connect(self.path, isolation_level=None)
-            # In WAL mode a killed process loses only the transaction in work.
+            # In WAL mode a killed process loses only its open transaction.
             self._connection.execute("PRAGMA journal_mode=WAL")
             self._connection.execute("PRAGMA synchronous=NORMAL")
             self._connection.execute(

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from corrsfm import config as cfg
 from corrsfm.errors import WorkspaceError
 from corrsfm.types import Pair
+from corrsfm.workspace.commands import label_of
 from corrsfm.workspace.folder import StageRecord, Workspace
 from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index, read_pairs
@@ -49,11 +50,11 @@ class StageOutcome:
     ----------
     stage : str
     num_items, num_reused : int
-        Items of the stage, and how many of them were there already.
+        Items of the stage, and how many of them an earlier run had made.
     seconds : float
         Wall-clock seconds of this call.
     skipped : bool
-        True if nothing was to do.
+        True if everything was up to date.
     """
 
     stage: str
@@ -64,8 +65,8 @@ class StageOutcome:
 
     def __str__(self) -> str:
         """One line for a person; the columns of several stages are aligned."""
-        state = "kept" if self.skipped else f"{self.seconds:.1f} s"
-        return f"{self.stage:<17}{self.num_items:>8}   {state}"
+        state = "up to date" if self.skipped else f"{self.seconds:.1f} s"
+        return f"{label_of(self.stage):<17}{self.num_items:>8}   {state}"
 
 
 def complete(
@@ -110,9 +111,13 @@ def complete(
         return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
     explain(workspace, stage, config)
     if finished and missing:
-        logger.info("%s: %d of %d kept, %d to do", stage, len(finished), len(wanted), len(missing))
+        logger.info(
+            "%s: %d of %d up to date, %d to do", label_of(stage), len(finished), len(wanted), len(missing)
+        )
     try:
-        with tqdm(total=len(wanted), initial=len(finished), desc=stage, unit=unit, leave=False) as bar:
+        with tqdm(
+            total=len(wanted), initial=len(finished), desc=label_of(stage), unit=unit, leave=False
+        ) as bar:
             for key, item in produce(missing):
                 store.add(key, wanted[key], item)
                 bar.update()
@@ -162,7 +167,7 @@ def explain(workspace: Workspace, stage: str, config: Any) -> None:
         if record.config.get(key) != new[key]
     ]
     reason = ", ".join(changes) if changes else "what it depends on changed"
-    logger.info("%s: redone where needed (%s)", stage, reason)
+    logger.info("%s: redone where needed (%s)", label_of(stage), reason)
 
 
 def _shown(value: object) -> str:
@@ -181,7 +186,7 @@ def wanted_matches(workspace: Workspace) -> dict[Pair, str]:
 def mark_left_out(fingerprint: str) -> str:
     """Fingerprint for a photo that was left out, in place of that of its features.
 
-    It is another one so that the photo is tried again when there is another chance.
+    The two differ, so that a later run tries the photo again.
     """
     return f"{_LEFT_OUT} {fingerprint}"
 

@@ -208,7 +208,7 @@ def test_a_log_has_a_line_for_every_stage_and_no_progress_bars(photos: Path, tmp
     # Whether a model comes out of such photos does not matter here.
     text = subprocess.run(command, check=False, capture_output=True, text=True, timeout=100).stderr
     assert "\r" not in text
-    stages = ("images", "features", "pairs", "matches", "pruned matches", "verified matches")
+    stages = ("images", "features", "pairs", "matches", "kept matches", "verified matches")
     firsts = [line[:17].strip() for line in text.splitlines()]
     assert [first for first in firsts if first in stages] == list(stages)
 

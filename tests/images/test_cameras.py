@@ -36,7 +36,7 @@ def test_photos_that_may_share_a_camera_are_counted_with_the_option_for_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("INFO")
-    equal = "photos of equal size tell no focal length and get a camera each"
+    equal = "photos of equal size have no focal length in EXIF and get a camera each"
     ids_of([PLAIN, PHONE, PLAIN], CameraMode.AUTO)
     assert caplog.messages == [f"2 {equal}; if one camera took them all, use --camera-mode single"]
     caplog.clear()
