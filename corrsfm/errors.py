@@ -7,10 +7,10 @@ its text and exits non-zero. A text names the file or the pair, what was expecte
 
     CorrsfmError
     ├── ConfigError            an option or a pipeline file is wrong
-    ├── InputError             the photos, lists or models handed in cannot be used
-    │   └── ImageError         one photo cannot be used
-    ├── WorkspaceError         a workspace is missing something, is damaged, locked or of another version
-    ├── CheckpointError        a network checkpoint is not what it should be
+    ├── InputError             photos, lists or models that the user gave are not usable
+    │   └── ImageError         one photo is not usable
+    ├── WorkspaceError         a workspace lacks a file, is damaged, locked or of another version
+    ├── CheckpointError        a network checkpoint is damaged or of another network
     ├── DatabaseError          the COLMAP database cannot be read or written
     ├── ReconstructionError    mapping produced no model
     └── DependencyError        an optional package is needed and absent
@@ -45,15 +45,15 @@ class ConfigError(CorrsfmError):
 
 
 class InputError(CorrsfmError):
-    """Photos, lists or models handed in by the user cannot be used."""
+    """Photos, lists or models that the user gave are not usable."""
 
 
 class ImageError(InputError):
-    """One photo cannot be used; the text begins with its name."""
+    """One photo is not usable; the text begins with its name."""
 
 
 class WorkspaceError(CorrsfmError):
-    """A workspace misses an artefact, holds a damaged one, is locked or of another version."""
+    """A workspace lacks a file, holds a damaged one, is locked or of another version."""
 
 
 class CheckpointError(CorrsfmError):
@@ -69,7 +69,7 @@ class ReconstructionError(CorrsfmError):
 
 
 class DependencyError(CorrsfmError):
-    """An optional package is needed for this operation and is not installed.
+    """An optional package that this operation needs is not installed.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ class DependencyError(CorrsfmError):
 
 
 def first_few(names: Iterable[str]) -> str:
-    """The first of many names, and how many more there are, for a text that must stay readable."""
+    """Join the first few names and count the rest, to keep a message readable."""
     names = list(names)
     rest = len(names) - _MAX_NAMED
     return ", ".join(names[:_MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")

@@ -45,7 +45,7 @@ def _remove(path: Path) -> None:
 
 
 def _replace_folder(source: Path, target: Path) -> None:
-    """Put a folder in another's place; a kill in between leaves none, never a mixture."""
+    """Put a folder in another's place; a kill in between leaves neither, never a mixture."""
     old = target.with_name(f".{target.name}.old")
     _remove(old)
     if target.exists():

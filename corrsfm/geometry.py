@@ -110,8 +110,8 @@ def pose_error_deg(
 ) -> tuple[float, float]:
     """Rotation error and direction error of the translation, in degrees.
 
-    The translation's sign is not judged, as in the literature: its error is ``min(e, 180 − e)``. One of no
-    length or not finite has no direction and gets the largest error, 90.
+    The translation's sign is not judged, as in the literature: its error is ``min(e, 180 − e)``. A
+    translation of zero length or with non-finite entries gets the largest error, 90.
     """
     rotation_error = rotation_angle_deg(
         np.asarray(rotation, np.float64) @ np.asarray(true_rotation, np.float64).T

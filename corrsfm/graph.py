@@ -1,4 +1,4 @@
-"""Which photos pairs connect."""
+"""Groups of photos that pairs connect."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def connected_components(names: Sequence[str], pairs: Iterable[Pair]) -> list[li
 
 
 def describe_components(names: Sequence[str], pairs: Iterable[Pair]) -> str:
-    """What is wrong if the pairs do not connect all photos; empty if they do."""
+    """Describe the groups if the pairs do not connect all photos; empty if they do."""
     components = connected_components(names, pairs)
     if len(components) < 2:
         return ""

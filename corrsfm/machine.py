@@ -1,4 +1,4 @@
-"""What this process runs on: threads, a device, versions."""
+"""Threads, devices and versions that this process runs on."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ R = TypeVar("R")
 
 
 def count_threads(wanted: int) -> int:
-    """Number of threads to use: as many as wanted, or for 0 all that this process may have."""
+    """Number of threads to use; 0 means every core that this process may use."""
     if wanted:
         return wanted
-    # Inside a batch job the machine has more cores than the job.
+    # A batch job may use fewer cores than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -48,10 +48,10 @@ def find_device(name: str) -> str:
     if name == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     try:
-        torch.zeros(1, device=name).cpu()  # back again, because a device "meta" holds nothing
+        torch.zeros(1, device=name).cpu()  # copied back because the device "meta" allocates nothing
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
-        if reason.startswith("Expected one of"):  # and then all devices that torch was ever ported to
+        if reason.startswith("Expected one of"):  # torch then lists every device it knows of
             reason = "there is no such device"
         raise ConfigError(
             f"--device {name}: torch {torch.__version__} cannot use it here ({reason}); "
@@ -86,7 +86,7 @@ def threaded(work: Callable[[K], R], keys: Iterable[K], num_threads: int) -> Ite
 
 
 def versions(packages: Iterable[str] = RECORDED_PACKAGES) -> dict[str, str]:
-    """Versions of corrsfm, Python and those of the packages that are installed."""
+    """Versions of corrsfm, of Python and of the installed packages among these."""
     found = {"corrsfm": __version__, "python": platform.python_version()}
     for package in packages:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):

@@ -90,7 +90,7 @@ def run_scene(
 
 
 def _say(outcome: StageOutcome) -> None:
-    """One line about a finished stage, which also stays where no progress bar is drawn."""
+    """Log one line about a finished stage; logs without progress bars show it too."""
     logger.info("%s", outcome)
 
 
@@ -113,7 +113,7 @@ def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, A
 
 
 def check_options(run: cfg.RunConfig, prune: cfg.PruneConfig | None = None) -> None:
-    """Find out before any work whether the device, and the checkpoint of a method, can be used.
+    """Check the device, and the checkpoint of a method, before any work is done.
 
     Parameters
     ----------

@@ -1,15 +1,15 @@
-"""The frozen records that stages exchange, and the one statement of the conventions they follow.
+"""Frozen records that stages exchange, and the conventions they follow.
 
 Pixels
     COLMAP's convention everywhere in memory: the centre of the first pixel is (0.5, 0.5), x to the right,
-    y down. HDF5 files follow hloc and put it at (0, 0); `corrsfm.store` converts, nothing else does.
+    y down. HDF5 files follow hloc and put it at (0, 0); `corrsfm.workspace.hloc` converts, nothing else does.
 Normalised coordinates
     ``(x, y)`` such that ``(x, y, 1)`` is the viewing ray in the camera frame (x right, y down, z forward).
 Images of a pair
     are ``0`` and ``1``; transforms are named ``cam1_from_cam0``; an essential matrix fulfils
     ``x1ᵀ E x0 = 0``.
 Names
-    An image's name is its posix path relative to the image folder; it is the only key that is ever used.
+    An image's name is its posix path relative to the image folder; nothing else is used as a key.
 
 Shapes and dtypes are checked once, here, at construction; a mismatch raises `ValueError` because it is a
 programming error, not a user's.
@@ -348,7 +348,7 @@ class PruneResult:
     Attributes
     ----------
     scores : (M,) float32
-        Confidence that a match is right, in [0, 1], in the order of the putative matches.
+        Confidence that a match is an inlier, in [0, 1], in the order of the putative matches.
     inlier_mask : (M,) bool
         The matches to keep. A pair pruned to nothing has no True entry and stays recorded.
     model : TwoViewModel or None

@@ -47,8 +47,8 @@ def compare(
 ) -> None:
     """Compare prune methods on the same photos.
 
-    Features and matches are made once. The table goes to standard output, the page with the pairs that differ
-    most to OUTPUT/compare.html.
+    Features and matches are computed once. The table goes to standard output, the page with the pairs that
+    differ most to OUTPUT/compare.html.
     """
     source = click.get_current_context().get_parameter_source("method")
     if source is ParameterSource.COMMANDLINE:

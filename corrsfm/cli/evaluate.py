@@ -77,7 +77,7 @@ def _show(values: dict[str, Any], as_json: bool) -> None:
     f"Estimators: {ESTIMATORS}.",
 )
 @click.option("--baseline", help="Method that differences refer to; the first one if not given.")
-@click.option("--max-per-scene", type=click.IntRange(min=1), help="Use so many random pairs of each scene.")
+@click.option("--max-per-scene", type=click.IntRange(min=1), help="Random pairs used of each scene.")
 @results_option
 @run_options
 @overwrite_option
@@ -92,7 +92,7 @@ def pose(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Relative pose and matches kept, on labelled pairs.
+    """Measure relative poses and kept matches on labelled pairs.
 
     FILE.h5 is in OANet's layout (YFCC100M, SUN3D) or comes from `corrsfm train prepare`.
     """
@@ -130,7 +130,7 @@ def homography(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Homography of planes, on a folder in HPatches' layout."""
+    """Measure homographies of planes on a folder in HPatches' layout."""
     from tqdm import tqdm
 
     from corrsfm.evaluation.two_view.homography import evaluate_homography
@@ -167,7 +167,7 @@ def homography(
 )
 @json_option
 def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
-    """A reconstruction against known cameras. WORKSPACE may also be a COLMAP model."""
+    """Compare a reconstruction with known cameras. WORKSPACE may also be a COLMAP model."""
     from corrsfm.evaluation.scenes.score import evaluate_scene
 
     score = evaluate_scene(workspace_dir, ground_truth)

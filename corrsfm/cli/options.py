@@ -29,7 +29,7 @@ __all__ = [
     "run_options",
 ]
 
-# Where an invocation notes that finished work is to be redone.
+# Set in the context of an invocation with --overwrite.
 OVERWRITE_KEY = "corrsfm.overwrite"
 
 logger = logging.getLogger("corrsfm")
@@ -93,7 +93,7 @@ def pipeline_options(command: F, *, several_methods: bool = False) -> F:
     """``--pipeline FILE`` and a flag for every option of every stage.
 
     The command is called with ``config=PipelineConfig(...)``: the file's values, overridden by the flags that
-    the user really typed. One with ``several_methods`` prunes by others than the config's, so that no option
+    the user typed. One with ``several_methods`` prunes by others than the config's, so that no option
     of pruning is idle.
     """
     file_option = click.option(
@@ -111,7 +111,7 @@ def recipe_options(command: F) -> F:
     """``--config FILE`` and a flag for every option of a training run.
 
     The command is called with ``recipe=TrainRecipe(...)``: the file's values, overridden by the flags that
-    the user really typed.
+    the user typed.
     """
     from corrsfm.training.config import TrainRecipe, load_recipe
 
@@ -134,7 +134,7 @@ def _overriding(
 ) -> F:
     """A command called with the config in its option ``file``, and flags that override some tables of it.
 
-    Of tables in ``used`` no flag is idle, whatever the others say.
+    Flags of the tables in ``used`` are never reported as idle.
     """
 
     @functools.wraps(command)
@@ -176,7 +176,7 @@ def _override(base: Any, values: dict[str, Any], *, may_be_idle: bool = True) ->
 
 
 def _warn_of_idle(config: Any, given: Collection[str]) -> None:
-    """Say which of the given options have no effect with what another option chooses."""
+    """Warn of given options that have no effect with the choice of another option."""
     idle: dict[str, list[str]] = {}
     for entry in dataclasses.fields(config):
         if entry.name not in given or entry.metadata["used_with"] is None:

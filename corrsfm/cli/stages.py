@@ -72,7 +72,7 @@ def extract(
     """Index photos, extract features, match.
 
     Lists the photos and their cameras, extracts SIFT features, chooses pairs and finds the nearest neighbour
-    of every keypoint, with its distance ratio and whether it is mutual.
+    of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm import pipeline
     from corrsfm.workspace import Workspace
@@ -115,7 +115,7 @@ def match(
 ) -> None:
     """Match the chosen pairs again.
 
-    Every keypoint gets its nearest neighbour, with its distance ratio and whether it is mutual.
+    Finds the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm.matches.stage import match_pairs
 
@@ -138,7 +138,7 @@ def prune(
 ) -> None:
     """Prune matches and write the database.
 
-    What the method keeps of the putative matches is written to a COLMAP database and verified geometrically.
+    Writes the kept matches to a COLMAP database and verifies them geometrically.
     """
     from corrsfm.database.stage import verify_matches
     from corrsfm.prune.stage import prune_matches
@@ -179,7 +179,7 @@ def reconstruct(
 def report(workspace_dir: Path, as_json: bool) -> None:
     """Print the statistics and write the page.
 
-    Writes report.json and report.html, a page that needs nothing but itself.
+    Writes report.json and report.html, a self-contained page.
     """
     _print_report(workspace_dir, as_json, html=True)
 

@@ -1,4 +1,4 @@
-"""Cameras as pycolmap's objects and as our record, and points normalised by them."""
+"""Conversion of cameras to and from pycolmap, and normalisation of points."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["camera_from_pycolmap", "normalise_points", "to_pycolmap"]
 
 
 def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
-    """The camera as pycolmap's object; ids are COLMAP's and start at 1."""
+    """Convert to pycolmap's camera; ids are COLMAP's and start at 1."""
     import pycolmap
 
     return pycolmap.Camera(
@@ -30,7 +30,7 @@ def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
 
 
 def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
-    """pycolmap's object as our record; the id is dropped."""
+    """Convert from pycolmap's camera; the id is dropped."""
     return Camera(
         model=camera.model_name,
         width=int(camera.width),
@@ -41,7 +41,7 @@ def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
 
 
 def normalise_points(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Undo the full camera model, distortion included.
+    """Normalise pixels by the full camera model, distortion included.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ def pycolmap_version() -> str:
 
 @contextlib.contextmanager
 def colmap_log(log_file: Path | None = None) -> Iterator[None]:
-    """Keep pycolmap quiet; collect what it has to say in a file.
+    """Keep pycolmap quiet; collect its messages in a file.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""COLMAP models: reading them, and in numbers."""
+"""Reading COLMAP models and summarising them in numbers."""
 
 from __future__ import annotations
 
@@ -67,10 +67,10 @@ def observation_errors(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 
 def summarise_model(model: pycolmap.Reconstruction) -> ModelSummary:
-    """A model in numbers."""
+    """Summarise a model in numbers."""
     errors = observation_errors(model)
     num_images = model.num_reg_images()
-    # Without points all of them are undefined.
+    # Errors are undefined without points.
     mean, median, p95 = (
         (errors.mean(), *np.percentile(errors, [50, 95])) if len(errors) else (np.nan, np.nan, np.nan)
     )

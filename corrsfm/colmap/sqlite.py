@@ -1,4 +1,4 @@
-"""COLMAP's database as a file: is it whole, and what its failures mean."""
+"""COLMAP's database as a file: whether it is whole, and what its error messages mean."""
 
 from __future__ import annotations
 
@@ -92,9 +92,9 @@ def is_sqlite(path: Path) -> bool:
 
 
 def is_truncated(path: Path) -> bool:
-    """Whether an SQLite database lacks bytes that its header promises; also so of an empty file.
+    """Whether an SQLite database lacks bytes that its header promises; true of an empty file too.
 
-    Quick whatever the size of the file, because only the header is read; what was damaged in its place is not
+    Only the header is read, so it is quick for any size, but damage inside the file is not
     found. False for a file that is not an SQLite database.
     """
     size = path.stat().st_size

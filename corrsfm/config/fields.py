@@ -1,4 +1,4 @@
-"""Options: fields of config dataclasses with help and bounds; plain values to a config and back."""
+"""Fields of config dataclasses: help, bounds and flags, and plain values to a config and back."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def option(
     affects_result: bool = True,
     used_with: tuple[str, tuple[StrEnum, ...]] | None = None,
 ) -> Any:
-    """A dataclass field with what the command line and the resume logic need to know about it.
+    """Declare a field with the metadata that the command line and the resume logic need.
 
     Parameters
     ----------

@@ -180,7 +180,7 @@ _RATIO = ("method", (PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC
 class PruneConfig:
     """Pruning of putative matches."""
 
-    # What measured best on the validation scenes, see results/pose_val_scenes.json.
+    # The best on the validation scenes, see results/pose_val_scenes.json.
     method: PruneMethod = option(
         PruneMethod.CORRADAPTOR,
         "How putative matches are pruned; all but corradaptor and cascade need no network",

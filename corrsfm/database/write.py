@@ -1,8 +1,8 @@
 """Features and kept matches → a COLMAP database with verified two-view geometries.
 
 Everything goes through pycolmap's API, so the schema is always the one that pycolmap expects. Verification
-is `pycolmap.geometric_verification`, which estimates geometries from the matches that are there; its
-neighbour `verify_matches` would match the descriptors of pairs again whose matches were dropped.
+is `pycolmap.geometric_verification`, which estimates geometries from the stored matches; its neighbour
+`verify_matches` would match descriptors again and bring dropped matches back.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ def write_database(
     images : sequence of ImageRecord
         Written in order of their names; positions from GPS become pose priors.
     cameras : sequence of Camera
-        What the images' ``camera_id`` points into.
+        Indexed by the images' ``camera_id``.
     features : callable
-        Image name → `Features`; called once an image.
+        Image name → `Features`; called once for each.
     kept : iterable of (str, str, (K, 2) int32)
         Two image names and the indices of the kept matches; K may be 0, and the pair stays on record.
     config : DatabaseConfig
@@ -88,7 +88,7 @@ def _check_not_in_use(path: Path) -> None:
         if path.stat().st_size and not is_sqlite(path):
             raise DatabaseError(f"{path}: is not a COLMAP database; move it away and try again")
         return
-    # Opening and closing settles what a killed process has left.
+    # Opening and closing merges the log of a killed process.
     with colmap_log(), database_errors(path):
         if path.exists():
             pycolmap.Database.open(path).close()
@@ -192,7 +192,7 @@ def _check_pair(
     name1: str,
     indices: NDArray[np.int32],
 ) -> None:
-    """Catch what pycolmap would take without a word, or answer with "constraint failed"."""
+    """Refuse pairs that pycolmap would accept silently, or answer with "constraint failed"."""
     pair = f"pair {name0} – {name1}"
     for name in (name0, name1):
         if name not in image_ids:

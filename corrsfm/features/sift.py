@@ -39,7 +39,7 @@ FINEST_OCTAVE = 255  # OpenCV keeps the octave in the low byte; -1 is the double
 
 
 def algorithm_of(extractor: Extractor) -> str:
-    """Version of the steps here and of the libraries they use, between which features may differ."""
+    """Version of the steps here and of the libraries they use, which decide about equal features."""
     library = "" if extractor == Extractor.OPENCV else f" pycolmap {pycolmap_version()}"
     # OpenCV also reads and scales the photos that pycolmap sees.
     return f"features-1 cv2 {'.'.join(cv2.__version__.split('.')[:2])}{library}"
@@ -48,7 +48,7 @@ def algorithm_of(extractor: Extractor) -> str:
 def create_extractor(
     config: FeaturesConfig,
 ) -> Callable[[NDArray[np.uint8], NDArray[np.bool_] | None], Features]:
-    """A function ``(image, mask) → Features`` with the options bound; safe to call from several threads."""
+    """A function ``(image, mask) → Features`` with the options bound; thread-safe."""
 
     def extract(image: NDArray[np.uint8], mask: NDArray[np.bool_] | None = None) -> Features:
         return extract_features(

@@ -98,7 +98,7 @@ def extract_features(
 
 
 def _no_features(index: Index, record: ImageRecord) -> Features:
-    """Features of a photo that was left out."""
+    """Empty features for a photo that was left out."""
     camera = index.camera_of(record)
     none = np.zeros(0, np.float32)
     return Features(

@@ -16,17 +16,17 @@ __all__ = ["PhotoCache"]
 
 
 class PhotoCache:
-    """Hashes and headers of photos, remembered as long as the file stays the same.
+    """Hashes and headers of photos, kept as long as the file does not change.
 
-    The same means its size, the times of its content and of its entry, and its number in the file system: a
-    copy over it or a swap may keep the first two.
+    A change shows in its size, its modification and change times or its inode: a copy over it or a swap may
+    keep the first two.
 
     Reading them decodes every photo, which a resumed run of thousands of photos should not do again.
 
     Parameters
     ----------
     path : Path
-        The file that remembers; a missing or damaged one remembers nothing.
+        The file of the cache; a missing or damaged one counts as empty.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,7 +42,7 @@ class PhotoCache:
         return self._value(path, "sha256", sha256_of)
 
     def info_of(self, path: Path) -> PhotoInfo:
-        """As `corrsfm.images.read_photo_info`."""
+        """As `corrsfm.images.photos.read_photo_info`."""
         values = self._value(path, "info", lambda photo: dataclasses.asdict(read_photo_info(photo)))
         # JSON has no tuples.
         return PhotoInfo(**{**values, "gps": tuple(values["gps"]) if values["gps"] else None})
@@ -50,7 +50,7 @@ class PhotoCache:
     def _value(self, path: Path, key: str, compute: Callable[[Path], Any]) -> Any:
         try:
             stat = path.stat()
-        except OSError:  # a broken link; what reads it says so
+        except OSError:  # a broken link; reading it will raise
             return compute(path)
         name = str(path.resolve())
         stamp = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
@@ -61,5 +61,5 @@ class PhotoCache:
         return entry[key]
 
     def save(self) -> None:
-        """Remember the photos that were asked for since construction, and no others."""
+        """Write the cache with the photos asked for since construction, and no others."""
         atomic_write_json(self._path, self._kept)

@@ -1,4 +1,4 @@
-"""Cameras: which photos share one, what is known about each, and points normalised by it."""
+"""Which photos share a camera, and what is known about each camera."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ logger = logging.getLogger("corrsfm")
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoInfo:
-    """What a photo says about its camera.
+    """Size of a photo, and camera and position from its EXIF.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ def assign_cameras(
         One per name.
     mode : CameraMode
         ``auto`` shares a camera among photos of equal size, EXIF camera and focal length. Photos without EXIF
-        get one each, as in COLMAP: equal size is no proof, and a wrongly shared camera ruins a model.
+        get one each, as in COLMAP: equal size proves nothing, and a wrongly shared camera ruins a model.
         A camera that photos share by any other mode starts from the median of their known focal lengths; a
         warning names its photos if these differ by more than a few per cent.
     model : str
@@ -144,7 +144,7 @@ def _suggest_sharing(infos: Sequence[PhotoInfo]) -> None:
 
 
 def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:
-    """Say so if photos that share a camera, given as names and focal lengths, were taken at several."""
+    """Warn if photos that share a camera, given as names and focal lengths, were zoomed."""
     known = sorted((focal, name) for name, focal in focals if focal is not None)
     if known and known[-1][0] > SAME_FOCAL_RATIO * known[0][0]:
         logger.warning(

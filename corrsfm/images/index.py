@@ -30,7 +30,7 @@ def index_images(
     hash_of: Callable[[Path], str] | None = None,
     info_of: Callable[[Path], PhotoInfo] | None = None,
 ) -> tuple[list[ImageRecord], list[Camera]]:
-    """List the photos of a scene and say what is known of each.
+    """List the photos of a scene with their hashes, cameras and positions.
 
     Parameters
     ----------
@@ -39,8 +39,7 @@ def index_images(
     threads : int
         Photos whose headers are read at a time.
     hash_of, info_of : callable, optional
-        Stand-ins for `corrsfm.files.sha256_of` and `read_photo_info`, for a caller that remembers their
-        results.
+        Replacements for `corrsfm.files.sha256_of` and `read_photo_info`, such as a cache.
 
     Returns
     -------
@@ -101,7 +100,7 @@ def index_images(
 
 
 def name_remarks(names: Sequence[str]) -> list[str]:
-    """What other programs may stumble over in the names of the photos; corrsfm copes with all of it."""
+    """Warn of photo names that other programs cannot handle; corrsfm can."""
     remarks = []
     spaced = [name for name in names if any(character.isspace() for character in name)]
     if spaced:

@@ -1,4 +1,4 @@
-"""Names: which files of a folder are the photos, and which are their masks."""
+"""Which files of a folder are photos, and which are masks."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
         photos are used, whatever their suffix.
     mask_dir : Path, optional
         Folder of masks. If it lies inside the folder, nothing in it is a photo; if it is the folder itself,
-        ``NAME.png`` beside a photo ``NAME`` is none. A list overrules this.
+        ``NAME.png`` beside a photo ``NAME`` is not a photo. A list overrules this.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def _visible_files(folder: Path) -> list[str]:
 
 
 def _warn_of_foreign(files: Sequence[str], names: Sequence[str]) -> None:
-    """Say which photos are not read; a raw photo beside the same one as JPEG is not missed."""
+    """Name photos in formats that are not read, unless the same photo is there as JPEG."""
     read = {PurePosixPath(name).with_suffix("") for name in names}
     foreign = [
         file
@@ -162,7 +162,7 @@ def find_masks(mask_dir: Path | None, folder: Path, names: Sequence[str]) -> lis
 def _stray_masks(mask_dir: Path, folder: Path) -> list[str]:
     """Pictures among the masks that are neither the mask of a file among the photos nor a photo."""
     if folder.resolve().is_relative_to(mask_dir.resolve()):
-        return []  # the photos are among the masks: nothing tells one from the other
+        return []  # photos and masks share a folder and look alike
     return [
         name
         for name in _visible_files(mask_dir)
@@ -172,12 +172,12 @@ def _stray_masks(mask_dir: Path, folder: Path) -> list[str]:
 
 
 def _census(files: Sequence[str]) -> str:
-    """What is in a folder instead of photos."""
+    """Describe what a folder holds instead of photos."""
     return f"only {_count_suffixes(files)}" if files else "no visible files at all"
 
 
 def _count_suffixes(files: Sequence[str]) -> str:
-    """How many files there are of each suffix, for those that most of them have."""
+    """Count files by suffix, for the most frequent suffixes."""
     suffixes = Counter(PurePosixPath(name).suffix.lower() or "no suffix" for name in files)
     return ", ".join(f"{count} × {suffix}" for suffix, count in suffixes.most_common(5))
 

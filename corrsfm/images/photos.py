@@ -135,7 +135,7 @@ def read_photo_info(path: Path) -> PhotoInfo:
 def _position(
     latitude: float | None, longitude: float | None, altitude: float | None
 ) -> tuple[float, float, float] | None:
-    """The position in EXIF if it is one on earth; an altitude that is none becomes 0."""
+    """Position from EXIF if it is a place on earth; an altitude that is missing or NaN becomes 0."""
     # Receivers without a fix write 0, or 0/0, which is read as NaN.
     if latitude is None or longitude is None or (latitude, longitude) == (0.0, 0.0):
         return None

@@ -71,7 +71,7 @@ def index_photos(
 
 
 def _explain_photos(workspace: Workspace, index: Index) -> None:
-    """Say which photos changed since the workspace last saw them."""
+    """Log which photos are new, gone or changed since the last run."""
     if workspace.record_of("images") is None:
         return
     try:
@@ -90,7 +90,7 @@ def _explain_photos(workspace: Workspace, index: Index) -> None:
 
 
 def _refuse_vanished_photos(workspace: Workspace, images_dir: Path) -> None:
-    """Stop before a folder that is wrong or not mounted costs the work on the photos that it should hold.
+    """Stop if the folder lacks most known photos: it may be the wrong one, or not mounted.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 Descriptors are bytes, so all products and sums that make a squared distance are integers. With D ≤ 128 they
 stay below 2²⁴ and float32 holds them exactly: the result does not depend on block size, number of threads or
-device, and equal distances are really equal. (bfloat16 and float16 could hold the bytes, but not the sums.)
+device, and equal distances compare equal. (bfloat16 and float16 could hold the bytes, but not the sums.)
 Among equal distances the lowest keypoint index wins.
 """
 
@@ -164,7 +164,7 @@ def _update_two_nearest(
 def _mutual(best: torch.Tensor, index: torch.Tensor, best_back: torch.Tensor) -> torch.Tensor:
     """(N0,) bool: whether no keypoint of image 0 is closer to the match, or as close with a lower index.
 
-    Comparing distances spares the column indices, whose search would take longer than the products.
+    Comparing distances avoids searching column indices, which would take longer than the products.
     """
     closest = best == best_back[index]
     own = torch.arange(len(best), device=best.device)

@@ -25,7 +25,7 @@ def match_pairs(
     store = ItemStore(workspace.features, FEATURES)
     wanted = wanted_matches(workspace)
     device = find_device(run.device)
-    # On a CPU a thread takes a pair: threads that share a pair wait for each other at every step.
+    # On a CPU each thread takes its own pair: threads that share one wait for each other at every step.
     on_cpu = device == "cpu"
     use_threads(1 if on_cpu else count_threads(run.threads))
     with store.reader() as read:

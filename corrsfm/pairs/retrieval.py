@@ -1,4 +1,4 @@
-"""Which photos look alike, from the scene's own local descriptors: no download, no pretrained vocabulary.
+"""Retrieval of similar photos from the scene's own local descriptors, without a pretrained vocabulary.
 
 Every photo becomes one vector: its RootSIFT descriptors, rotated to the directions in which descriptors of
 this scene vary most, are assigned to the nearest of a few words learned from a sample of the scene, and the
@@ -150,7 +150,7 @@ def most_similar(
     Parameters
     ----------
     vectors : (N, V) float
-        Zero vectors have no neighbours and are nobody's neighbour.
+        A zero vector has no neighbours and is not returned as one.
     num_neighbours : int
     block_size : int
         Rows compared at a time; the memory is proportional to its square.
@@ -158,7 +158,7 @@ def most_similar(
     Returns
     -------
     list of (≤ num_neighbours,) int64
-        Without the vector itself; equals in the order of their indices.
+        Without the vector itself; ties in order of index.
     """
     usable = np.flatnonzero(np.any(vectors != 0, axis=1))
     result: list[NDArray[np.int64]] = [np.zeros(0, np.int64) for _ in range(len(vectors))]

@@ -70,7 +70,7 @@ def make_pairs(
 
 
 def _without(names: set[str], pair_list: PairList) -> PairList:
-    """The pairs of a list that are of other photos than these."""
+    """Drop the pairs that contain one of these photos."""
     kept = [number for number, pair in enumerate(pair_list.pairs) if names.isdisjoint(pair)]
     return PairList(
         pairs=tuple(pair_list.pairs[number] for number in kept),

@@ -114,7 +114,7 @@ def make_pairs(
 
 
 def _resolve(config: PairsConfig, num_photos: int) -> list[PairStrategy]:
-    """The strategies without repetition, ``auto`` replaced by what it stands for."""
+    """Resolve ``auto`` and drop repetitions."""
     strategies = set(config.pairing)
     if PairStrategy.AUTO in strategies:
         strategies.remove(PairStrategy.AUTO)
@@ -160,7 +160,7 @@ def natural_order(names: Sequence[str]) -> list[int]:
     """Indices that sort names the way people count: img2 before img10, folder by folder."""
 
     def key(index: int) -> tuple:
-        # Splitting by a group alternates text and digits, so that like meets like.
+        # Splitting by a group alternates text and digits, so that text meets text in comparisons.
         parts = [re.split(r"([0-9]+)", part) for part in names[index].split("/")]
         return (
             [[int(p) if i % 2 else p.casefold() for i, p in enumerate(pieces)] for pieces in parts],
@@ -254,7 +254,7 @@ def _earth_fixed(positions_deg: NDArray[np.float64]) -> NDArray[np.float64]:
 def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:
     """Pairs from a text file with ``name0 name1`` per line.
 
-    Names that contain spaces may be separated by a tab or quoted; plain spaces do where only one way to part
+    Names that contain spaces may be separated by a tab or quoted; plain spaces work if only one split of
     the line gives two known names. Lines that begin with ``#`` are comments.
 
     Raises

@@ -1,9 +1,10 @@
-"""Matches → pruned matches: every prune method behind one interface, numpy in and numpy out.
+"""Putative matches → kept matches: every prune method behind one interface, numpy in and numpy out.
 
 ::
 
     prune/
     ├── __init__.py          the interface and `build_pruner`; imports nothing heavy
+    ├── stage.py             files to files
     ├── correspondences.py   putative matches as methods see them, shared with training
     ├── robust.py            LO-RANSAC, MAGSAC++ and the errors to a model
     ├── classical.py         none, ratio, loransac, magsac
@@ -45,8 +46,8 @@ class PrunerProtocol(Protocol):
     name : str
         The method.
     fingerprint : str
-        Everything that the results depend on besides the input: options, seed, checkpoint. Equal
-        fingerprints mean that finished work may be kept.
+        Options, seed and checkpoint that results depend on besides the input. Equal fingerprints mean
+        that finished work may be kept.
     """
 
     @property
@@ -134,7 +135,7 @@ def checkpoint_sha256(config: PruneConfig) -> str | None:
 
 
 def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Pruner:
-    # Here, not above: it loads torch.
+    # Imported late because it loads torch.
     from corrsfm.prune.learned import Pruner
 
     return Pruner.load(

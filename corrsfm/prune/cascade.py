@@ -1,4 +1,4 @@
-"""Prune method ``cascade``: the ratio test where it is enough, the network where it can help.
+"""Prune method ``cascade``: the ratio test where it is enough, the network where it helps.
 
 The ratio test and the mutual check cost nothing. Where they leave many matches, a robust estimator finds the
 geometry from those as well as from the network's; where they leave hardly any, the photos share too little

@@ -50,7 +50,7 @@ def _result_from_estimate(
         Matches that took part in the estimation; others score 0.
     estimate : TwoViewEstimate
     max_error_px : float
-        Error, in pixels, from which on the score is 0.
+        Error in pixels at which the score reaches 0.
     decided_by : str
 
     Returns

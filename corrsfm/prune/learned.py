@@ -27,7 +27,7 @@ __all__ = ["Pruner", "choose_precision", "pack_batches"]
 
 logger = logging.getLogger(__name__)
 
-# The weighted eight-point algorithm sees what two prunings leave; of fewer it makes an arbitrary matrix.
+# Fewer matches than this after two prunings give the eight-point algorithm an arbitrary matrix.
 _MIN_NUM_FOR_MATRIX = 8
 
 MIN_BFLOAT16_CHANNELS = 64
@@ -39,7 +39,7 @@ _GUARD_MIN_SHARE = 0.1
 
 
 class NetworkEstimate(NamedTuple):
-    """What the network says about one pair."""
+    """Output of the network for one pair."""
 
     logits: NDArray[np.float32]
     """(M,) last logit of every match, −inf for those that the network did not see."""
@@ -60,7 +60,7 @@ def choose_precision(precision: Precision, device: torch.device, channels: int) 
     if device.type == "cuda":
         native = torch.cuda.get_device_capability(device)[0] >= 8
     else:
-        # Older releases know fewer of these questions; not being able to ask means float32.
+        # Older releases lack some of these queries; without them use float32.
         native = any(
             getattr(torch.cpu, question, bool)()
             for question in ("_is_avx512_bf16_supported", "_is_amx_tile_supported")
@@ -84,7 +84,7 @@ def pack_batches(sizes: Sequence[int], max_batch_matches: int) -> list[list[int]
         Positions in ``sizes``, largest first; each occurs once.
     """
     batches: list[list[int]] = []
-    # Largest first: what does not fit into memory fails at the start, not after hours.
+    # Largest first, so that running out of memory happens at the start, not after hours.
     for index in sorted(range(len(sizes)), key=lambda position: -sizes[position]):
         if batches and (len(batches[-1]) + 1) * sizes[batches[-1][0]] <= max_batch_matches:
             batches[-1].append(index)
@@ -113,10 +113,10 @@ class Pruner:
         Bound of the matches in a batch, padding included; bounds memory.
     precision : Precision
     threads : int
-        Pairs at a time on a CPU; 0 for all cores.
+        Pairs pruned at a time on a CPU; 0 for all cores.
     batched : bool, optional
-        Run several pairs as one batch. If not given, so on a GPU; on a CPU a thread takes a pair, because
-        padding costs more there than a batch gains and threads that share a pair wait for each other.
+        Run several pairs as one batch; by default on a GPU only. On a CPU each thread takes its own pair:
+        padding costs more there than a batch gains, and threads that share a pair wait for each other.
     compile : bool
         Compile the network; pays off on a GPU for many pairs.
     """
@@ -224,7 +224,7 @@ class Pruner:
         return estimates
 
     def _run(self, items: Sequence[tuple[Correspondences, NDArray[np.intp]]]) -> Iterator[NetworkEstimate]:
-        """Run a batch; when memory runs out, its halves."""
+        """Run a batch, or its halves when memory runs out."""
         try:
             yield from self._forward(items)
             return

@@ -37,7 +37,7 @@ MIN_NUM_INLIERS = 8
 
 _CONFIDENCE = 0.9999
 _MAX_MAGSAC_ITERATIONS = 10_000
-# Errors of right matches follow a χ distribution, whose 99 % quantile is 3.64 σ; OpenCV's threshold is σ.
+# Errors of inliers follow a χ distribution, whose 99 % quantile is 3.64 σ; OpenCV's threshold is σ.
 _MAGSAC_QUANTILE = 3.64
 
 
@@ -233,7 +233,7 @@ def _mean_focal_length_px(pair: Correspondences) -> float:
 
 
 def _residual_of_nothing(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances with infinity for what has none: coordinates that are not finite."""
+    """Set distances of non-finite coordinates to infinity."""
     return np.where(np.isfinite(values), values, np.inf)
 
 

@@ -1,4 +1,4 @@
-"""Which matches the network sees, what its answer says of each, and which are kept."""
+"""Which matches the network sees, how its logits become scores, and which matches are kept."""
 
 from __future__ import annotations
 
@@ -55,10 +55,10 @@ def score_matches(logits: NDArray[np.float32], residuals: NDArray[np.float32]) -
     -------
     (M,) float32
         The logistic function of the logit. For an unseen match ``a · exp(−residual / 1e-4)``, where a is
-        the share of the probable matches that the matrix explains: what is known of its quality.
+        the share of the probable matches that the matrix explains.
     """
     unseen = np.isneginf(logits)
-    with np.errstate(over="ignore"):  # of exp(∞), whose limit is right
+    with np.errstate(over="ignore"):  # exp(∞) has the right limit
         scores = 1.0 / (1.0 + np.exp(-logits))
     probable = scores > POSE_MIN_SCORE
     agreement = float(np.mean(residuals[probable] < MAX_RESIDUAL)) if probable.any() else 0.0
@@ -81,8 +81,8 @@ def select_kept(
         Confidence of the network in each match, in [0, 1].
     operating_point : OperatingPoint
         ``pose``: score above 0.5. ``sfm``: mutual matches with a score above 0.3; of a pair with fewer than
-        20 above 0.7, which as a rule shows two places, only those. (The network learned from overlapping
-        photos and finds some order everywhere: of 114 pairs of a validation scene that share nothing, 110
+        20 above 0.7, which usually shows two places, only those. (The network learned from overlapping
+        photos and finds structure everywhere: of 114 pairs of a validation scene that share nothing, 110
         passed COLMAP's verification without this. Of 119 such pairs of two validation scenes 8 % have 20, of
         449 that share 50 points or more 92 %.)
 

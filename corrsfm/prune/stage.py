@@ -23,8 +23,8 @@ __all__ = ["prune_matches"]
 logger = logging.getLogger("corrsfm")
 
 CACHED_IMAGES = 512
-# A killed run loses at most the pairs that are pruned together, which take a few seconds: a GPU and the
-# estimators on native threads want many, a network on a CPU takes up to a second for one.
+# A killed run loses at most the pairs pruned together, a few seconds of work: many on a GPU or with native
+# threads, few with a network on a CPU, which takes up to a second for one.
 PAIRS_PRUNED_TOGETHER = 128
 PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD = 2
 

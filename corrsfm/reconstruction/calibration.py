@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 __all__ = ["focal_length_ratios", "is_plausible", "refine_intrinsics"]
 
-# COLMAP gives up a photo beyond these while it maps, but not after the last bundle adjustment.
+# COLMAP drops a photo beyond these while it maps, but not after the last bundle adjustment.
 _SMALLEST_RATIO, _LARGEST_RATIO = 0.1, 10.0
 # Zoom lenses and crops differ by as much, but rarely in so large a share of one model.
 _LARGEST_FACTOR, _LARGEST_SHARE = 2.0, 0.2
 
 _REFINEMENTS = 3
-# COLMAP's own limits of a point that stays.
+# COLMAP's own limits for keeping a point.
 _MAX_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
 
 def focal_length_ratios(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
-    """Focal length over the longest side of every registered photo whose EXIF data does not tell it.
+    """Focal length over the longest side, for every registered photo without one in EXIF.
 
     Returns
     -------
@@ -43,9 +43,9 @@ def focal_length_ratios(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 
 def is_plausible(model: pycolmap.Reconstruction) -> bool:
-    """Whether the focal lengths that a model found for photos without EXIF can be those of cameras.
+    """Whether the focal lengths that a model found for photos without EXIF are plausible.
 
-    Not, if one is below a tenth or above ten times the longest side of the photo, or if more than a fifth of
+    They are not if one is below a tenth or above ten times the longest side of the photo, or if more than a fifth of
     them differ from their median by more than a factor of two.
     """
     ratios = focal_length_ratios(model)
@@ -74,7 +74,7 @@ def refine_intrinsics(
     options.print_summary = False
     options.refine_principal_point = refine_principal_point
     options.ceres.solver_options.num_threads = num_threads or -1
-    # `pycolmap.bundle_adjustment` does the same and turns the log to the terminal on.
+    # `pycolmap.bundle_adjustment` does the same but logs to the terminal.
     problem = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         problem.add_image(image_id)

@@ -1,4 +1,4 @@
-"""Why mapping made no model, told from the graph of verified pairs."""
+"""Why mapping made no model, from the graph of verified pairs."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def read_pair_graph(database: Path) -> PairGraph:
 
 
 def why_no_model(graph: PairGraph, cut_off: str = "") -> str:
-    """The reason for an empty result, drawn from the graph of verified pairs unless mapping was cut off."""
+    """The reason for an empty result, from the graph of verified pairs unless mapping was cut off."""
 
     def best(counts: dict[int, int]) -> str:
         pair = max(counts, key=lambda pair: (counts[pair], -pair))

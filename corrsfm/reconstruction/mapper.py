@@ -87,7 +87,7 @@ def reconstruct(
         pycolmap.set_random_seed(seed)
         _warn_of_unused(config)
         started = time.monotonic()
-        # pycolmap insists on an existing folder even if no photo is read.
+        # pycolmap wants an existing folder even if it reads no photo.
         mapped = _run_mapper(
             database,
             images_dir or scratch,
@@ -125,7 +125,7 @@ def _warn_of_unused(config: ReconstructionConfig) -> None:
 
 
 def _cut_off(config: ReconstructionConfig, seconds: float) -> str:
-    """That mapping was stopped before its end, if it was; pycolmap itself tells its log only."""
+    """Say that the time limit stopped mapping, if it did; pycolmap tells only its log."""
     limit = _max_runtime_seconds(config)
     if config.mapper is Mapper.GLOBAL or not limit or seconds < limit:
         return ""
@@ -143,7 +143,7 @@ def _incremental_options(
     config: ReconstructionConfig, output: Path, seed: int, num_threads: int
 ) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    # Verification has decided which pairs are good; a second threshold here could only contradict it.
+    # Verification decides which pairs are good; a second threshold here could only contradict it.
     options.min_num_matches = 1
     options.min_model_size = config.min_model_size
     options.multiple_models = config.multiple_models
@@ -234,7 +234,7 @@ def _map_with_held_intrinsics(
     options: pycolmap.IncrementalPipelineOptions,
     on_progress: Callable[[int], None],
 ) -> dict[int, pycolmap.Reconstruction]:
-    """Map with focal lengths and distortion held, then refine them in the whole models."""
+    """Map with focal lengths and distortion held, then refine them in the finished models."""
     held = copy.deepcopy(options)
     held.ba_refine_focal_length = held.ba_refine_extra_params = held.ba_refine_principal_point = False
     (scratch / "held").mkdir()
@@ -253,7 +253,7 @@ def _largest(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstructi
 
 
 def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction) -> bool:
-    """Whether a model registers more photos than another, or as many and sees more of its points."""
+    """Whether a model registers more photos than another, or as many with more observations."""
 
     def size(one: pycolmap.Reconstruction) -> tuple[int, int]:
         return one.num_reg_images(), one.compute_num_observations()
@@ -262,7 +262,7 @@ def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Recons
 
 
 def _check_calibration(model: pycolmap.Reconstruction) -> None:
-    """Warn of a model that no cameras can have taken."""
+    """Warn of a model with implausible focal lengths."""
     if not is_plausible(model):
         ratios = focal_length_ratios(model)
         logger.warning(
@@ -274,9 +274,9 @@ def _check_calibration(model: pycolmap.Reconstruction) -> None:
 
 
 def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function that does not look for Ctrl-C, and let Ctrl-C through all the same.
+    """Call a function that ignores Ctrl-C, and obey Ctrl-C all the same.
 
-    After an interruption the call goes on in its thread until it is done or the process ends; its result is
+    After an interruption the call runs on in its thread until it ends or the process does; its result is
     dropped.
     """
     outcome: dict[str, Any] = {}
@@ -297,9 +297,9 @@ def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def _ranked(models: Iterable[pycolmap.Reconstruction], min_model_size: int) -> list[pycolmap.Reconstruction]:
-    """The models that count, the largest first; the first one counts whatever its size.
+    """The models to keep, the largest first; the first one is kept whatever its size.
 
-    A model whose photos all lie in one larger model is a failed start of the same place and not kept.
+    A model whose photos all lie in one larger model is a failed start at the same place and is dropped.
     """
 
     def rank(model: pycolmap.Reconstruction) -> tuple[int, int, str]:
@@ -308,7 +308,7 @@ def _ranked(models: Iterable[pycolmap.Reconstruction], min_model_size: int) -> l
     ranked = sorted((model for model in models if model.num_reg_images() > 1), key=rank)
     kept = ranked[:1]
     for model in ranked[1:]:
-        # The mappers do not always obey their option of this name.
+        # The mappers sometimes ignore their option of this name.
         large_enough = model.num_reg_images() >= min_model_size
         if large_enough and not any(_names(model) <= _names(larger) for larger in kept):
             kept.append(model)

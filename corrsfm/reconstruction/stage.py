@@ -38,7 +38,7 @@ def reconstruct(
     started = time.monotonic()
     verified = require_database(workspace)
     fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
-    # Models without colours are made again once the photos are back.
+    # Models without colours are remade once the photos are back.
     black = config_hash("black", fingerprint)
     images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
     current = [fingerprint] if images_dir else [fingerprint, black]
@@ -77,7 +77,7 @@ def reconstruct(
 
 
 def _show_progress(bar: tqdm, num_registered: int) -> None:
-    # Another model, or another try at the same one, begins.
+    # A new model, or a new attempt at the same one, begins.
     if num_registered < bar.n:
         bar.reset()
     bar.n = num_registered
@@ -85,7 +85,7 @@ def _show_progress(bar: tqdm, num_registered: int) -> None:
 
 
 def _warn_of_parts(workspace: Workspace, names: list[str]) -> None:
-    """Warn before mapping if the verified pairs do not connect the photos that have any."""
+    """Warn before mapping if the verified pairs do not connect the photos."""
     parts = [
         part
         for part in connected_components(names, names_of_verified_pairs(workspace.database))

@@ -3,7 +3,9 @@
 ::
 
     report/
-    ├── scene.py        the statistics, and why photos are missing
+    ├── stage.py        files to files
+    ├── statistics.py   the statistics of a scene
+    ├── missing.py      why photos are missing
     ├── table.py        the statistics as text
     ├── page.py         the HTML page, `write_html`
     ├── style.py        its look

@@ -79,7 +79,7 @@ def bars(rows: Sequence[tuple[str, float]], unit: str) -> str:
 
 
 def matrix(picture_uri: str, names: Sequence[str]) -> str:
-    """A square picture whose rows and columns are photos, with their numbers along two sides."""
+    """A square picture of photos by photos, with their numbers along two sides."""
     side, margin = 500, 34
     parts = [
         f'<image href="{picture_uri}" x="{margin}" y="{margin}" width="{side}" height="{side}" '
@@ -108,7 +108,7 @@ def _svg(width: float, height: float, label: str, parts: Sequence[str]) -> str:
 
 
 def _nice(least: int) -> int:
-    """The smallest number of one digit, or one and a half, times a power of ten that is not below."""
+    """The smallest of 1, 1.5, 2, 3 … 9 times a power of ten that is not below a number."""
     power = 1
     while True:
         for factor in (1, 1.5, 2, 2.5, 3, 4, 5, 6, 8):

@@ -12,7 +12,7 @@ __all__ = ["MissingPhoto", "MissingReason", "missing_photos"]
 
 
 class MissingReason(StrEnum):
-    """Why a photo is not in the first model: the first step of the pipeline that lost it."""
+    """Why a photo is not in the first model: the first stage that lost it."""
 
     LEFT_OUT = "unreadable, left out"
     NO_PAIR = "no pair"
@@ -93,7 +93,7 @@ def _main_component(components: Sequence[tuple[str, ...]], models: Sequence[Mode
 def _lost_at(
     name: str, pairs: Sequence[PairStatistics], component: tuple[str, ...], main: tuple[str, ...]
 ) -> tuple[MissingReason, str]:
-    """The first step after which nothing of a photo's pairs was left, and the numbers behind it."""
+    """The first stage that left a photo without matches, and the numbers behind it."""
     if not pairs:
         return MissingReason.NO_PAIR, "it was not matched with any photo"
     among = f"{len(pairs)} pair" + ("s" if len(pairs) > 1 else "")

@@ -17,13 +17,13 @@ _MAX_POINTS = 20_000
 # Points farther from the middle than this times the 75th percentile of all distances are not shown: a few of
 # them, far behind the scene, would shrink the rest to a dot.
 _REACH = 2.5
-# Length of the mean viewing direction above which photos are said to look one way.
+# Above this length of the mean viewing direction, photos count as looking one way.
 _COMMON_DIRECTION = 0.3
 
 
 @dataclass(frozen=True, kw_only=True)
 class ModelView:
-    """What of a model is shown, turned so that z is up.
+    """The part of a model that is drawn, turned so that z is up.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ def make_view(model: pycolmap.Reconstruction) -> ModelView:
 
 
 def _upright(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation that takes the average "up" of the photos to z, and where they look, or are not, to y."""
+    """Rotation that takes the photos' average up to z, and their common viewing direction to y."""
     # Cameras look along z with y down, and the rows of a rotation are the camera's axes in the world.
     up = -rotations[:, 1].sum(axis=0)
     if np.linalg.norm(up) < 1e-6:
@@ -131,7 +131,7 @@ def _frustum(
 
 
 def plotly_view(view: ModelView) -> str:
-    """An interactive view as a piece of HTML that brings plotly's script along.
+    """An interactive view as HTML with plotly's script included.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One HTML page about a scene that needs nothing but itself: statistics, pictures and the model in 3-D."""
+"""A self-contained HTML page about a scene: statistics, pictures and the model in 3-D."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _THUMBNAILS = 24
 _THUMBNAIL_SIZE = 120
 _LISTED_PAIRS = 300
 
-# Nothing may be loaded from anywhere; plotly compiles its shaders' glue code at run time.
+# Nothing is loaded from elsewhere; plotly compiles code at run time.
 _POLICY = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
     "script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:"
@@ -103,7 +103,7 @@ def _section(title: str, body: str) -> str:
 
 
 def _tiles(report: SceneReport) -> str:
-    """The numbers that are looked for first."""
+    """The headline numbers."""
     tiles = [
         ("photos registered", f"{report.num_registered} / {len(report.image_names)}"),
         *([("photos in all models", f"{report.num_in_models}")] if len(report.models) > 1 else []),

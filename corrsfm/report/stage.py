@@ -27,9 +27,9 @@ logger = logging.getLogger("corrsfm")
 
 
 def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
-    """Gather the statistics of a workspace; write `report.json` and, if asked for, `report.html`.
+    """Summarise a workspace; write `report.json` and, if asked for, `report.html`.
 
-    Works without models too and then tells why there are none. Models of earlier matches are left out.
+    Without models the report says why there are none. Models of earlier matches are left out.
     """
     require_database(workspace)
     records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}

@@ -1,4 +1,4 @@
-"""The statistics of a scene, and why photos are missing from its model."""
+"""Statistics of a scene as a record, and as plain values for JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FORMAT_VERSION = 1
 
 @dataclass(frozen=True, kw_only=True)
 class SceneReport:
-    """All there is to say about a scene.
+    """The statistics of a scene.
 
     Attributes
     ----------
@@ -140,7 +140,7 @@ def make_report(
     configuration: Mapping[str, Any] | None = None,
     versions: Mapping[str, str] | None = None,
 ) -> SceneReport:
-    """Gather the facts about a scene and find out why photos are missing.
+    """Build the report of a scene and find out why photos are missing.
 
     Parameters
     ----------

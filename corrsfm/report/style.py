@@ -1,4 +1,4 @@
-"""The look of the page: dark on light, from a phone to a wide screen, on paper, too."""
+"""The look of the page: dark on light, for phones, wide screens and paper."""
 
 STYLE = """
 :root { --ink: #22262b; --quiet: #5c6670; --line: #d9d7d0; --paper: #faf9f6; --card: #ffffff;

@@ -82,7 +82,7 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
 
 
 def _in_models(report: SceneReport) -> str:
-    """What the largest model alone does not tell."""
+    """Photos in all models, if there are several."""
     return f", {report.num_in_models:,} in all models" if len(report.models) > 1 else ""
 
 

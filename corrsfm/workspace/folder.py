@@ -77,7 +77,7 @@ class StageRecord:
 
 
 class Workspace:
-    """A folder with the artefacts of one scene.
+    """The folder of one scene.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ class Workspace:
     create : bool
         Make the folder if it does not exist; otherwise that is an error.
     images_dir : Path, optional
-        Folder of the photos that it is for.
+        Folder of its photos.
 
     Raises
     ------
@@ -127,7 +127,7 @@ class Workspace:
             )
         if self.root.exists() and not self.root.is_dir():
             raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")
-        # A workspace that lost its manifest still has what only corrsfm writes.
+        # Only corrsfm writes these files: the folder is a workspace that lost its manifest.
         own = self.photo_cache.exists() or self.images_json.exists()
         foreign = [path.name for path in (self.database, self.sparse) if path.exists()]
         if foreign and not own:
@@ -217,7 +217,7 @@ class Workspace:
         atomic_write_json(self.manifest, self._values)
 
     def record_of(self, stage: str) -> StageRecord | None:
-        """What is recorded of a stage, or None if it never finished."""
+        """The record of a stage, or None if it never finished."""
         values = self._values["stages"].get(stage)
         return StageRecord(**values) if values else None
 
@@ -250,7 +250,7 @@ class Workspace:
         return record
 
     def current_record_of(self, stage: str) -> StageRecord | None:
-        """What is recorded of a stage if its inputs have not changed since; else None."""
+        """The record of a stage if its inputs have not changed since; else None."""
         try:
             return self.require(stage)
         except WorkspaceError:
@@ -289,15 +289,15 @@ class Workspace:
 
     @property
     def mapping_failed(self) -> bool:
-        """Whether mapping was tried on the verified matches that there are now and no model came out."""
+        """Whether mapping the current verified matches produced no model."""
         verified = self.record_of("verified matches")
         return verified is not None and self._values.get("mapping_failed") == verified.fingerprint
 
     def put_models_aside(self) -> None:
         """Remember that mapping failed, and move the models of earlier matches out of the way.
 
-        They go to ``sparse.old``, with the reports about them, so that nobody takes them for new. What was
-        was moved there before is replaced.
+        They go to ``sparse.old``, with the reports about them, so that they are not mistaken for new ones,
+        and replace what was moved there before.
         """
         self.forget("models")
         if verified := self.record_of("verified matches"):
@@ -317,7 +317,7 @@ class Workspace:
 
 
 def _check_manifest(values: dict[str, Any]) -> None:
-    """Raise now what a damaged manifest would raise later."""
+    """Check a manifest on loading, so that damage is reported at once."""
     if not isinstance(values["images_dir"], str | None):
         raise TypeError("images_dir is not text")
     for record in values["stages"].values():

@@ -50,7 +50,7 @@ Attributes = dict[str, Any]
 
 @dataclass(frozen=True, kw_only=True)
 class PrunedMatches:
-    """What `pruned.h5` keeps of a pair.
+    """Matches of a pair that passed pruning, as `pruned.h5` stores them.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ def _encode_features(features: Features) -> tuple[Arrays, Attributes]:
 
 
 def _decode_features(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Features:
-    """Ours or hloc's: what hloc does not write gets a neutral value."""
+    """Read our layout or hloc's; arrays that hloc does not write get neutral values."""
     keypoints = np.asarray(arrays["keypoints"], np.float32) + HALF_PIXEL
     num = len(keypoints)
     descriptors = _sift_descriptors(np.asarray(arrays["descriptors"], np.float32).T, num)
@@ -178,7 +178,7 @@ def _encode_matches(matches: Matches) -> tuple[Arrays, Attributes]:
 
 def _decode_matches(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Matches:
     indices, scores = _gather(arrays)
-    # hloc's own matchers do not say which matches are mutual; its default matcher keeps only mutual ones.
+    # hloc's files do not mark mutual matches; its default matcher keeps no others.
     mutual = (
         np.asarray(arrays["mutual0"], np.bool_)[indices[:, 0]]
         if "mutual0" in arrays

@@ -25,7 +25,7 @@ __all__ = ["Journal"]
 
 logger = logging.getLogger("corrsfm")
 
-# SQLite keeps what is not yet in the file itself beside it.
+# SQLite keeps recent transactions in these files beside the database.
 _SUFFIXES = ("", "-wal", "-shm")
 
 
@@ -57,7 +57,7 @@ class Journal:
         return self._connection
 
     def _execute(self, statement: str, parameters: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-        """Rows that a statement gives; of a damaged file, those of a new one in its place."""
+        """Rows of a statement; a damaged file is replaced by a new one first."""
         try:
             try:
                 return self._connect().execute(statement, parameters).fetchall()
@@ -103,7 +103,7 @@ class Journal:
             with np.load(io.BytesIO(rows[0][0]), allow_pickle=False) as stored:
                 values = dict(stored)
         except (ValueError, EOFError, zipfile.BadZipFile) as error:
-            # SQLite has no checksum of what it holds, the archive of an item has.
+            # SQLite stores no checksums; the archive of an item does.
             self._execute("DELETE FROM items WHERE key = ?", (key,))
             logger.warning("%s: %s is damaged (%s) and not used", self.path, key, error)
             return None

@@ -1,4 +1,4 @@
-"""The index of a workspace: which photos there are, which cameras took them and which pairs to match.
+"""Lists of a workspace: its photos, their cameras and the pairs to match.
 
 `images.txt` names the photos and `pairs.txt` the pairs, one per line, for people and other tools;
 `images.json` adds hashes, cameras, masks and GPS positions, `pair_origins.tsv` where each pair came from.
@@ -33,7 +33,7 @@ class Index:
     ----------
     records : tuple of ImageRecord
     cameras : tuple of Camera
-        ``records[i].camera_id`` counts into it.
+        ``records[i].camera_id`` is an index into it.
     """
 
     records: tuple[ImageRecord, ...]
@@ -111,7 +111,7 @@ def read_pairs(workspace: Workspace) -> PairList:
     """
     path = workspace.pair_origins
     try:
-        # Not splitlines, which also ends a line at characters that a name may hold.
+        # splitlines would also split at characters that a name may hold.
         lines = path.read_text(encoding="utf-8").split("\n")
         rows = [line.split("\t") for line in lines if line]
         return PairList(

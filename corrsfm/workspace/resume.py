@@ -1,4 +1,4 @@
-"""Bringing the items of a stage up to date: keep what is there, do what is missing, say why.
+"""Bring the items of a stage up to date: keep finished ones, make missing ones, say why.
 
 An item (a photo's features, a pair's matches) carries the fingerprint of everything it was made from. A stage
 is the set of its items; it is current when every item is there with the fingerprint wanted now.
@@ -81,7 +81,7 @@ def complete(
     overwrite: bool,
     unit: str,
 ) -> StageOutcome:
-    """Bring a store of items to exactly the wanted ones, keeping those that are there.
+    """Bring a store to exactly the wanted items, keeping finished ones.
 
     Parameters
     ----------
@@ -92,13 +92,13 @@ def complete(
         Key → fingerprint of every item the stage consists of.
     produce : callable
         Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for. It
-        may first change what is ``wanted`` of the key, if it cannot make that.
+        may change the ``wanted`` fingerprint of a key that it could not make.
     config : dataclass
         The stage's options, for the record.
     inputs : dict
         Stage → fingerprint of what the items are made from.
     overwrite : bool
-        Do all items again.
+        Make all items again.
     unit : str
         What an item is, for the progress bar.
     """
@@ -204,7 +204,7 @@ def photos_left_out(workspace: Workspace, names: Iterable[str]) -> set[str]:
 
 
 def require_database(workspace: Workspace) -> StageRecord:
-    """The record of the verified matches, whose database must be whole.
+    """The record of the verified matches; their database must be whole.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A finished workspace to read from, for programs that want its features, matches and models."""
+"""Reading a finished workspace from Python: its features, matches and models."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def open_workspace(folder: Path | str) -> Scene:
 
 
 class Scene:
-    """What the stages left in a workspace; nothing is read before it is asked for.
+    """What the stages left in a workspace; each item is read when asked for.
 
     Parameters
     ----------

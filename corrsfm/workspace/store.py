@@ -28,9 +28,9 @@ FORMAT_VERSION = 1
 
 
 def _why_unreadable(error: OSError) -> str:
-    """What to tell of a file that HDF5 could not read, so that nobody deletes what is whole."""
+    """Explain why HDF5 could not read a file, so that nobody deletes a whole one."""
     if error.errno is None:
-        # What HDF5 itself says about the content: no signature, truncated, a wrong byte.
+        # HDF5 objects to the content: no signature, truncated, a wrong byte.
         return f"not a readable HDF5 file ({error}); delete it and run again"
     if "unable to lock" in str(error):
         if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES):
@@ -186,7 +186,7 @@ class ItemStore(Generic[K, T]):
         wanted : mapping
             Key → fingerprint.
         progress : callable
-            The keys, passed on one by one as they are written; for a progress bar.
+            Passes the keys on one by one as they are written; for a progress bar.
 
         Raises
         ------
@@ -208,8 +208,7 @@ class ItemStore(Generic[K, T]):
         self.discard_journal()
 
     def _require_space(self) -> None:
-        # HDF5 may crash the process when a disk fills up while it writes. The file grows no larger than what
-        # it is made from.
+        # HDF5 may crash the process when the disk fills up. The new file is no larger than its sources.
         needed = self.journal.num_bytes() + (self.path.stat().st_size if self.path.exists() else 0)
         free = shutil.disk_usage(self.path.parent).free
         if free < needed:
