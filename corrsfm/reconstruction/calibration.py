@@ -45,8 +45,8 @@ def focal_length_ratios(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 def is_plausible(model: pycolmap.Reconstruction) -> bool:
     """Whether the focal lengths that a model found for photos without EXIF are plausible.
 
-    They are not if one is below a tenth or above ten times the longest side of the photo, or if more than a fifth of
-    them differ from their median by more than a factor of two.
+    They are not if one is below a tenth or above ten times the longest side of the photo, or if more than a
+    fifth of them differ from their median by more than a factor of two.
     """
     ratios = focal_length_ratios(model)
     if not len(ratios):
