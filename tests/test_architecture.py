@@ -17,7 +17,10 @@ PACKAGE = Path(__file__).resolve().parents[1] / "corrsfm"
 STAGES = ("images", "features", "pairs", "matches", "prune", "database", "reconstruction", "report")
 # From the ground up; a room may import the rooms of the floors below it.
 FLOORS: list[tuple[str, set[str]]] = [
-    ("what everything may use", {"corrsfm", "errors", "types", "geometry", "graph", "files", "machine"}),
+    (
+        "what everything may use",
+        {"corrsfm", "errors", "camera", "types", "geometry", "graph", "files", "machine"},
+    ),
     ("the options", {"config"}),
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
@@ -29,7 +32,8 @@ FLOORS: list[tuple[str, set[str]]] = [
 FLOOR = {room: number for number, (_, rooms) in enumerate(FLOORS) for room in rooms}
 # On one floor only these imports are allowed: importer → imported, with the reason.
 ON_ONE_FLOOR: dict[tuple[str, str], str] = {
-    ("types", "errors"): "a camera that is not possible says so",
+    ("camera", "errors"): "a camera that is not possible says so",
+    ("types", "camera"): "the record stands beside the others",
     ("files", "errors"): "a file that cannot be read says so",
     ("machine", "errors"): "a device that cannot be used says so",
     ("graph", "errors"): "long lists of names are cut in one place",

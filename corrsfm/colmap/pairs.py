@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import database_errors
 from corrsfm.errors import DatabaseError
 from corrsfm.types import Pair, VerifiedPair
 
-__all__ = ["names_of_verified_pairs", "read_verified_pairs"]
+__all__ = ["names_of_verified_pairs", "read_verified_matches", "read_verified_pairs"]
 
 
 def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[VerifiedPair]:
@@ -69,3 +71,32 @@ def names_of_verified_pairs(path: Path) -> list[Pair]:
         counts = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
         pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id, num in counts if num > 0]
     return sorted((min(names[a], names[b]), max(names[a], names[b])) for a, b in pairs)
+
+
+def read_verified_matches(path: Path) -> dict[Pair, NDArray[np.int32]]:
+    """The matches of every pair with a two-view geometry that agree with it.
+
+    Returns
+    -------
+    dict of Pair to (K, 2) int32
+        Keypoint indices in the photos of the pair; pairs sorted, each with its smaller name first, K ≥ 1.
+
+    Raises
+    ------
+    DatabaseError
+        If there is no such database or it cannot be read.
+    """
+    if not path.exists():
+        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    found: dict[Pair, NDArray[np.int32]] = {}
+    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+            if not len(geometry.inlier_matches):
+                continue
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            matches = np.asarray(geometry.inlier_matches, np.int32).reshape(-1, 2)
+            if names[id0] > names[id1]:
+                id0, id1, matches = id1, id0, matches[:, ::-1]
+            found[names[id0], names[id1]] = np.ascontiguousarray(matches)
+    return dict(sorted(found.items()))

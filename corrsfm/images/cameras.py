@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from corrsfm.camera import CAMERA_PARAMETERS, Camera
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.config import CameraMode
 from corrsfm.errors import ConfigError, InputError, first_few
-from corrsfm.types import CAMERA_PARAMETERS, Camera
 
 if TYPE_CHECKING:
     pass

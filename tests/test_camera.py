@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from corrsfm.camera import CAMERA_PARAMETERS, Camera
 from corrsfm.colmap.cameras import normalise_points
 from corrsfm.errors import InputError
-from corrsfm.types import CAMERA_PARAMETERS, Camera
 
 
 def test_camera_models_and_their_parameters_are_those_of_colmap() -> None:
