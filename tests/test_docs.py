@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from corrsfm.cli import main
-from corrsfm.cli.reference import REFERENCE_FILE
+from tools.reference import REFERENCE_FILE
 
 
 def readme_commands(repository: Path) -> list[str]:
@@ -21,12 +21,12 @@ def readme_commands(repository: Path) -> list[str]:
     return [line for line in lines if line.startswith("corrsfm ")]
 
 
-def test_command_line_reference_is_current() -> None:
+def test_command_line_reference_is_current(repository: Path) -> None:
     # In a process of its own: click remembers how a command's help was asked for first.
-    code = (
-        "import sys; from corrsfm.cli.reference import render_reference; sys.stdout.write(render_reference())"
+    code = "import sys; from tools.reference import render_reference; sys.stdout.write(render_reference())"
+    result = subprocess.run(
+        [sys.executable, "-X", "utf8", "-c", code], capture_output=True, check=True, cwd=repository
     )
-    result = subprocess.run([sys.executable, "-X", "utf8", "-c", code], capture_output=True, check=True)
     assert REFERENCE_FILE.read_text(encoding="utf-8") == result.stdout.decode(), "run: make reference"
 
 
