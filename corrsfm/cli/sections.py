@@ -34,6 +34,13 @@ class SectionedOption(click.Option):
         super().__init__(*args, **kwargs)
         self.section = section
 
+    def get_help_extra(self, ctx: click.Context) -> Any:
+        """As click has it, but "default: off" instead of "default: no-such-option"."""
+        extra = super().get_help_extra(ctx)
+        if self.is_bool_flag and "default" in extra:
+            extra["default"] = "on" if self.default else "off"
+        return extra
+
 
 class SectionedCommand(click.Command):
     """A command whose help lists its options in sections, each option once.

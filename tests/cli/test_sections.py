@@ -85,6 +85,13 @@ def test_flags_stand_in_one_column_through_all_sections() -> None:
     assert len([text for text in texts if text]) > 15 and len(columns) == 1
 
 
+def test_switches_are_on_or_off_by_default() -> None:
+    output = " ".join(CliRunner().invoke(main, ["run", "--help"]).output.split())
+    assert "--root-sift / --no-root-sift Hellinger-normalise descriptors (RootSIFT). [default: on]" in output
+    assert "Also estimate the principal point. [default: off]" in output
+    assert "[default: no-" not in output
+
+
 def test_a_heading_names_the_table_and_says_what_it_is_about() -> None:
     assert section_of(cfg.FeaturesConfig) == "features – SIFT extraction"
     assert section_of(cfg.ReconstructionConfig) == "reconstruction – mapping by pycolmap"
