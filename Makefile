@@ -1,14 +1,17 @@
 # make demo   reconstruct a bundled scene, print the statistics, write a page to look at
-# make test   the default tests (minutes); make test-slow adds the sample scenes end to end
-# make reference   write the command-line reference anew
-# make lint   format check, linter, type checker
+# make test   the default tests (minutes)
+# make test-slow   the sample scenes end to end (more minutes)
+# make lint   format check, linter, type checker; make format repairs what it can
+# make reference   write docs/reference.md from the commands' help
+# make tables   write the tables of README.md and results/README.md from the result files
+# make clean   remove the environment and what was built
 
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format reference clean
+.PHONY: demo test test-slow lint format reference tables clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
@@ -38,7 +41,10 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 reference: $(STAMP)
-	$(BIN)/python -m corrsfm.cli.reference
+	$(BIN)/python tools/reference.py
+
+tables: $(STAMP)
+	$(BIN)/python tools/tables.py
 
 clean:
 	rm -rf $(VENV) demo build dist *.egg-info

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -130,3 +131,34 @@ def test_workspaces_inside_the_collection_are_no_scene(tmp_path: Path) -> None:
     root = collection(tmp_path, "a", "out")
     assert list(find_scenes(root)) == ["a", "out"]
     assert list(find_scenes(root, leave_out=root / "a" / ".." / "out")) == ["a"]
+
+
+def test_a_job_of_the_slurm_array_runs_the_scene_of_its_number(repository: Path, tmp_path: Path) -> None:
+    for scene in ("a", "b c", "d"):
+        (tmp_path / "collection" / scene / "images").mkdir(parents=True)
+    stand_in = tmp_path / "bin" / "corrsfm"
+    stand_in.parent.mkdir()
+    stand_in.write_text('#!/bin/sh\nprintf "%s\\n" "$@"\n')
+    stand_in.chmod(0o755)
+    result = subprocess.run(
+        [
+            "bash",
+            str(repository / "pipelines" / "collection.slurm"),
+            "collection",
+            "out",
+            "--method",
+            "ratio",
+        ],
+        cwd=tmp_path,
+        env={
+            "PATH": f"{stand_in.parent}:{os.environ['PATH']}",
+            "SLURM_ARRAY_TASK_ID": "1",
+            "SLURM_CPUS_PER_TASK": "8",
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stdout.splitlines() == [
+        "run", "collection/b c/images", "out/b c", "--threads", "8", "--method", "ratio",
+    ]  # fmt: skip

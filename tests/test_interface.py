@@ -96,8 +96,12 @@ def readme_example(repository: Path) -> str:
 def test_the_readmes_python_keeps_inliers_and_drops_outliers(repository: Path) -> None:
     code = readme_example(repository)
     assert len(code.strip().splitlines()) <= 10
-    pair = make_pair(seed=3, num=400, inlier_ratio=0.5).as_correspondences()
-    names = {"points0": pair.points0, "points1": pair.points1, "ratios": pair.ratios, "camera": pair.camera0}
+    pair = make_pair(seed=0, num=400, inlier_ratio=0.5)
+    # Through the camera of the example: 1920 px focal length, 1600 × 1200 px.
+    points = pair.as_correspondences().normalised * 1920.0 + np.tile([800.0, 600.0], 2)
+    names = {"points0": points[:, :2], "points1": points[:, 2:], "ratios": pair.ratios}
     exec(compile(code, "README.md", "exec"), names)
-    kept = names["kept"]
+    kept, right = names["kept"], pair.label_distances < 1e-9
     assert kept.shape == (400,) and kept.dtype == bool
+    assert right.sum() == 200
+    assert kept.sum() >= 30 and (kept & right).sum() >= 0.9 * kept.sum()

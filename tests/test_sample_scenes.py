@@ -58,7 +58,7 @@ def test_ground_truth_points_lie_where_the_photos_see_them(scene: Path) -> None:
 @each_scene
 def test_source_tells_origin_licence_and_recipe(scene: Path) -> None:
     source = (scene / "SOURCE.md").read_text(encoding="utf-8")
-    for word in ("Apache-2.0", f"sample_scenes/render.py {scene.name}", "PINHOLE"):
+    for word in ("Apache-2.0", f"sample_scenes/renderer/render.py {scene.name}", "PINHOLE"):
         assert word in source
 
 

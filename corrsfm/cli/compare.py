@@ -10,6 +10,7 @@ from click.core import ParameterSource
 
 from corrsfm.cli.evaluate import command_line
 from corrsfm.cli.options import echo_json, json_option, overwrite_option, pipeline_options
+from corrsfm.cli.sections import SectionedCommand
 from corrsfm.config import PipelineConfig
 
 __all__ = ["compare"]
@@ -17,7 +18,7 @@ __all__ = ["compare"]
 PATH = click.Path(path_type=Path)
 
 
-@click.command()
+@click.command(cls=SectionedCommand, most_used=("methods", "output", "ground_truth", "max_features", "file"))
 @click.argument("images_dir", metavar="IMAGES", type=PATH)
 @click.option(
     "--methods",

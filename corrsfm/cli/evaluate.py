@@ -1,4 +1,4 @@
-"""Commands that measure: two-view poses, homographies, whole scenes, and the tables made from the results."""
+"""Commands that measure: two-view poses, homographies, whole scenes."""
 
 from __future__ import annotations
 
@@ -185,24 +185,3 @@ def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
             f"median {score.position_error_median:.4g}, max {score.position_error_max:.4g} "
             f"in units of the ground truth (mean {score.position_error_percent:.2f} % of its extent)"
         )
-
-
-@evaluate.command()
-@click.argument("documents", metavar="DOCUMENT...", nargs=-1, required=True, type=PATH)
-@click.option(
-    "--results-dir", type=PATH, default=Path("results"), show_default=True, help="Folder of the result files."
-)
-@click.option("--check", is_flag=True, help="Change nothing; fail if a table differs from its results.")
-def tables(documents: tuple[Path, ...], results_dir: Path, check: bool) -> None:
-    """Render the tables of documents from result files.
-
-    A table stands between the lines `<!-- table:NAME -->` and `<!-- /table -->` and shows NAME.json.
-    """
-    from corrsfm.evaluation.tables import update_document
-
-    changed = [path for path in documents if update_document(path, results_dir, check=check)]
-    if changed and check:
-        names = ", ".join(str(path) for path in changed)
-        raise click.ClickException(f"tables differ from their results in {names}; run without --check")
-    for path in changed:
-        click.echo(f"{path}: tables rendered anew")

@@ -16,6 +16,7 @@ import click
 from click.core import ParameterSource
 
 from corrsfm import config as cfg
+from corrsfm.cli.sections import SectionedOption, section_of
 from corrsfm.config.fields import flag_of
 
 __all__ = [
@@ -37,8 +38,8 @@ logger = logging.getLogger("corrsfm")
 F = typing.TypeVar("F", bound=Callable[..., Any])
 
 
-def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
-    """One click option for one config field."""
+def _option(entry: dataclasses.Field, annotation: Any, section: str, *, hidden: bool) -> Callable[[F], F]:
+    """One click option for one config field, listed under a heading unless it is hidden."""
     flag = flag_of(entry.name)
     inner = next(
         (a for a in typing.get_args(annotation) if a is not type(None) and a is not Ellipsis), annotation
@@ -46,7 +47,14 @@ def _option(entry: dataclasses.Field, annotation: Any) -> Callable[[F], F]:
     text = entry.metadata["help"]
     if unit := entry.metadata["unit"]:
         text += f" [{unit}]"
-    settings: dict[str, Any] = {"help": text + ".", "default": entry.default, "show_default": True}
+    settings: dict[str, Any] = {
+        "cls": SectionedOption,
+        "section": section,
+        "hidden": hidden,
+        "help": text + ".",
+        "default": entry.default,
+        "show_default": True,
+    }
     if isinstance(entry.default, StrEnum):
         settings["default"] = str(entry.default)
     if annotation is bool:
@@ -93,8 +101,8 @@ def pipeline_options(command: F, *, several_methods: bool = False) -> F:
     """``--pipeline FILE`` and a flag for every option of every stage.
 
     The command is called with ``config=PipelineConfig(...)``: the file's values, overridden by the flags that
-    the user typed. One with ``several_methods`` prunes by others than the config's, so that no option
-    of pruning is idle.
+    the user typed. One with ``several_methods`` prunes by others than the config's: no option of pruning is
+    idle, and its help does not list ``--method``.
     """
     file_option = click.option(
         "--pipeline",
@@ -103,8 +111,10 @@ def pipeline_options(command: F, *, several_methods: bool = False) -> F:
         help="Pipeline file in TOML; flags typed here override it.",
     )
     tables = [entry.name for entry in dataclasses.fields(cfg.PipelineConfig)]
-    used = ["prune"] if several_methods else []
-    return file_option(_overriding(command, "config", cfg.PipelineConfig(), cfg.load_pipeline, tables, used))
+    used, hidden = (["prune"], ["method"]) if several_methods else ([], [])
+    return file_option(
+        _overriding(command, "config", cfg.PipelineConfig(), cfg.load_pipeline, tables, used, hidden)
+    )
 
 
 def recipe_options(command: F) -> F:
@@ -131,10 +141,11 @@ def _overriding(
     load: Callable[[Path], Any],
     tables: Sequence[str],
     used: Collection[str] = (),
+    hidden: Collection[str] = (),
 ) -> F:
     """A command called with the config in its option ``file``, and flags that override some tables of it.
 
-    Flags of the tables in ``used`` are never reported as idle.
+    Flags of the tables in ``used`` are never reported as idle; the help leaves out fields in ``hidden``.
     """
 
     @functools.wraps(command)
@@ -145,15 +156,16 @@ def _overriding(
         }
         return command(*args, **{keyword: dataclasses.replace(base, **changed)}, **kwargs)
 
-    return typing.cast(F, _with_flags(wrapped, [type(getattr(default, name)) for name in tables]))
+    return typing.cast(F, _with_flags(wrapped, [type(getattr(default, name)) for name in tables], hidden))
 
 
-def _with_flags(command: Callable, configs: Collection[type]) -> Callable:
+def _with_flags(command: Callable, configs: Collection[type], hidden: Collection[str] = ()) -> Callable:
     """Click options for every field of some config dataclasses, in order."""
     for cls in reversed(list(configs)):
         annotations = typing.get_type_hints(cls)
         for entry in reversed(dataclasses.fields(cls)):
-            command = _option(entry, annotations[entry.name])(command)
+            option = _option(entry, annotations[entry.name], section_of(cls), hidden=entry.name in hidden)
+            command = option(command)
     return command
 
 

@@ -18,6 +18,7 @@ from corrsfm.cli.options import (
     pipeline_options,
     run_options,
 )
+from corrsfm.cli.sections import SectionedCommand
 from corrsfm.errors import ReconstructionError
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def _step(
         return function(workspace, config, run, overwrite=overwrite)
 
 
-@click.command()
+@click.command(cls=SectionedCommand, most_used=("max_features", "camera_mode", "pairing"))
 @IMAGES
 @WORKSPACE
 @config_options(
@@ -89,7 +90,7 @@ def extract(
     _show(outcomes, as_json)
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.PairsConfig)
 @run_options
@@ -104,7 +105,7 @@ def pairs(
     _show([_step(make_pairs, workspace_dir, config, run, overwrite)], as_json)
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.MatchesConfig)
 @run_options
@@ -122,7 +123,7 @@ def match(
     _show([_step(match_pairs, workspace_dir, config, run, overwrite)], as_json)
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.PruneConfig, database=cfg.DatabaseConfig)
 @run_options
@@ -150,7 +151,7 @@ def prune(
     _show(outcomes, as_json)
 
 
-@click.command()
+@click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.ReconstructionConfig)
 @run_options
@@ -184,7 +185,11 @@ def report(workspace_dir: Path, as_json: bool) -> None:
     _print_report(workspace_dir, as_json, html=True)
 
 
-@click.command()
+@click.command(
+    cls=SectionedCommand,
+    most_used=("method", "max_features", "camera_mode", "pairing", "file"),
+    epilog="The other headings are the tables of a pipeline file: --max-ratio is max_ratio in [prune].",
+)
 @IMAGES
 @WORKSPACE
 @pipeline_options

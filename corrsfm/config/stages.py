@@ -106,7 +106,7 @@ class ImagesConfig:
     )
     camera_mode: CameraMode = option(
         CameraMode.AUTO,
-        "Photos that share a camera; auto groups equal size, make, model and focal length, and gives photos "
+        "Which photos share a camera; auto groups equal size, make, model and focal length, and gives photos "
         "without EXIF one each",
     )
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
@@ -138,8 +138,8 @@ class PairsConfig:
 
     pairing: tuple[PairStrategy, ...] = option(
         (PairStrategy.AUTO,),
-        "Strategy; give it several times for their union. auto: what --pairs-file or --covisible-model say "
-        "if given, else exhaustive up to 200 photos, then retrieval",
+        "How photos are paired; give it several times for the union. auto: what --pairs-file or "
+        "--covisible-model say if given, else exhaustive up to 200 photos, then retrieval",
     )
     sequential_overlap: int = option(
         10, "Neighbours on each side in natural name order", minimum=1, used_with=_SEQUENTIAL

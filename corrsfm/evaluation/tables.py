@@ -1,28 +1,42 @@
-"""Tables of documents, rendered from result files.
+"""Result files as Markdown tables.
 
-A document holds pairs of lines ``<!-- table:NAME -->`` and ``<!-- /table -->``; what is between them is the
-table of ``results/NAME.json`` and nothing else. A table without a file behind it does not exist.
+`corrsfm compare` and `corrsfm evaluate` print them; the project's documents show them by `make tables`.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from corrsfm.errors import InputError
-from corrsfm.evaluation.records import load_results
-from corrsfm.files import atomic_write_text
 
-__all__ = ["render_document", "render_table", "update_document"]
-
-_BLOCK = re.compile(r"(?P<start><!-- table:(?P<name>[\w.-]+) -->\n).*?(?P<end><!-- /table -->)", re.DOTALL)
+__all__ = ["Table", "build_table", "render_table"]
 
 
-def _markdown(header: list[str], rows: list[list[str]]) -> str:
-    rule = ["---"] + ["--:"] * (len(header) - 1)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in (header, rule, *rows))
+@dataclass(frozen=True, kw_only=True)
+class Table:
+    """A result file as text.
+
+    Attributes
+    ----------
+    header : list of str
+        The heading of every column; the first names what the rows are.
+    rows : list of list of str
+        One cell for each column.
+    caption : str
+        What the numbers were measured on and with.
+    """
+
+    header: list[str]
+    rows: list[list[str]]
+    caption: str
+
+    def markdown(self) -> str:
+        """The table and its caption; all columns but the first are aligned to the right."""
+        rule = ["---"] + ["--:"] * (len(self.header) - 1)
+        lines = [f"| {' | '.join(cells)} |" for cells in (self.header, rule, *self.rows)]
+        return "\n".join([*lines, "", self.caption])
 
 
 def _number(value: float | None, digits: int = 1) -> str:
@@ -37,7 +51,7 @@ def _difference(interval: list[float] | None) -> str:
     return "–" if interval is None else f"{interval[0]:+.1f} [{interval[1]:+.1f}, {interval[2]:+.1f}]"
 
 
-def _pose_table(values: dict[str, Any]) -> str:
+def _pose_table(values: dict[str, Any]) -> Table:
     header = [
         "filter / estimator", "AUC@5 [95 %]", "AUC@10", "AUC@20", "AUC@5 − baseline", "mAP@5", "precision",
         "recall", "F", "kept", "filter ms", "estimator ms",
@@ -64,10 +78,10 @@ def _pose_table(values: dict[str, Any]) -> str:
         f"{subject['num_matches']:.0f} putative matches, {subject['inlier_percent']:.1f} % of them right. "
         f"{_origin(values)}"
     )
-    return f"{_markdown(header, rows)}\n\n{caption}"
+    return Table(header=header, rows=rows, caption=caption)
 
 
-def _homography_table(values: dict[str, Any]) -> str:
+def _homography_table(values: dict[str, Any]) -> Table:
     header = ["filter", "AUC@3 [95 %]", "AUC@5", "AUC@10", "kept", "failed"]
     rows = []
     for name, method in values["methods"].items():
@@ -83,10 +97,10 @@ def _homography_table(values: dict[str, Any]) -> str:
             ]
         )
     count = len(values["subject"]["sequences"])
-    return f"{_markdown(header, rows)}\n\n{count} sequences. {_origin(values)}"
+    return Table(header=header, rows=rows, caption=f"{count} sequences. {_origin(values)}")
 
 
-def _compare_table(values: dict[str, Any]) -> str:
+def _compare_table(values: dict[str, Any]) -> Table:
     truth = any(method.get("ground_truth") for method in values["methods"].values())
     header = [
         "method", "verified pairs", "inlier ratio", "photos", "points", "track length", "error px",
@@ -111,10 +125,10 @@ def _compare_table(values: dict[str, Any]) -> str:
             row += [_number(score.get("auc", {}).get(t)) for t in ("1", "5", "10")]
             row.append(_number(score.get("position_error_percent"), 2))
         rows.append(row)
-    return f"{_markdown(header, rows)}\n\n{_origin(values)}"
+    return Table(header=header, rows=rows, caption=_origin(values))
 
 
-def _pycolmap_table(values: dict[str, Any]) -> str:
+def _pycolmap_table(values: dict[str, Any]) -> Table:
     header = [
         "scene",
         "photos",
@@ -141,10 +155,10 @@ def _pycolmap_table(values: dict[str, Any]) -> str:
     caption = (
         f"Up to {values['subject']['max_features']} features a photo, exhaustive pairs. {_origin(values)}"
     )
-    return f"{_markdown(header, rows)}\n\n{caption}"
+    return Table(header=header, rows=rows, caption=caption)
 
 
-def _bench_table(values: dict[str, Any]) -> str:
+def _bench_table(values: dict[str, Any]) -> Table:
     header = ["matches", "batch", "device", "variant", "pairs/s", "speed ×", "memory ×"]
     rows = [
         [
@@ -160,7 +174,7 @@ def _bench_table(values: dict[str, Any]) -> str:
     ]
     subject, machine = values["subject"], values["provenance"]["machine"]
     caption = f"Network: {subject['model']}. {subject['threads']} threads of {machine['processor']}."
-    return f"{_markdown(header, rows)}\n\n{caption}"
+    return Table(header=header, rows=rows, caption=caption)
 
 
 def _origin(values: dict[str, Any]) -> str:
@@ -179,13 +193,26 @@ def _origin(values: dict[str, Any]) -> str:
     return f"{libraries}; seed {values['provenance']['seed']}."
 
 
-_RENDERERS: dict[str, Callable[[dict[str, Any]], str]] = {
+_RENDERERS: dict[str, Callable[[dict[str, Any]], Table]] = {
     "pose": _pose_table,
     "homography": _homography_table,
     "compare": _compare_table,
     "pycolmap": _pycolmap_table,
     "bench": _bench_table,
 }
+
+
+def build_table(values: dict[str, Any]) -> Table:
+    """The table of a result file's content.
+
+    Raises
+    ------
+    InputError
+        If there is none for its kind.
+    """
+    if values["kind"] not in _RENDERERS:
+        raise InputError(f"no table for results of kind {values['kind']}; there are {', '.join(_RENDERERS)}")
+    return _RENDERERS[values["kind"]](values)
 
 
 def render_table(values: dict[str, Any]) -> str:
@@ -196,66 +223,4 @@ def render_table(values: dict[str, Any]) -> str:
     InputError
         If there is no table for its kind.
     """
-    if values["kind"] not in _RENDERERS:
-        raise InputError(f"no table for results of kind {values['kind']}; there are {', '.join(_RENDERERS)}")
-    return _RENDERERS[values["kind"]](values)
-
-
-def render_document(text: str, results_dir: Path, *, where: str = "document") -> str:
-    """A document with every table rendered anew.
-
-    Parameters
-    ----------
-    text : str
-    results_dir : Path
-        Folder with ``NAME.json``.
-    where : str
-        The document's name, for messages.
-
-    Raises
-    ------
-    InputError
-        If a table has no result file, or a marker is left open.
-    """
-    opened, closed = text.count("<!-- table:"), text.count("<!-- /table -->")
-    if not opened == closed == len(_BLOCK.findall(text)):
-        raise InputError(
-            f"{where}: {opened} lines '<!-- table:NAME -->' and {closed} lines '<!-- /table -->'; "
-            "they must alternate, each on a line of its own"
-        )
-
-    def replace(match: re.Match[str]) -> str:
-        table = render_table(load_results(results_dir / f"{match['name']}.json"))
-        return f"{match['start']}{table}\n{match['end']}"
-
-    return _BLOCK.sub(replace, text)
-
-
-def update_document(path: Path, results_dir: Path, *, check: bool = False) -> bool:
-    """Render the tables of a document in place.
-
-    Parameters
-    ----------
-    path : Path
-    results_dir : Path
-    check : bool
-        Change nothing.
-
-    Returns
-    -------
-    bool
-        True if the document differed from its results.
-
-    Raises
-    ------
-    InputError
-        If the document cannot be read or a table has no result file.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    rendered = render_document(text, results_dir, where=str(path))
-    if rendered != text and not check:
-        atomic_write_text(path, rendered)
-    return rendered != text
+    return build_table(values).markdown()

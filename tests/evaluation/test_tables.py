@@ -1,4 +1,4 @@
-"""Tables in documents come from result files and from nowhere else."""
+"""Tables hold the numbers of their result files."""
 
 import json
 from pathlib import Path
@@ -8,9 +8,8 @@ from click.testing import CliRunner
 from two_view_pairs import make_pair
 
 from corrsfm.cli import main
-from corrsfm.errors import InputError
 from corrsfm.evaluation.records import load_results
-from corrsfm.evaluation.tables import render_document, render_table
+from corrsfm.evaluation.tables import render_table
 from corrsfm.evaluation.two_view.pose import evaluate_pose
 from corrsfm.labelled.oanet import write_pairs
 
@@ -21,9 +20,6 @@ def results_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_pairs(folder / "pairs.h5", [make_pair(seed=i, num=80, scene="a") for i in range(4)])
     evaluate_pose(folder / "pairs.h5", ["mutual/poselib", "oracle/poselib"], results=folder / "two_view.json")
     return folder
-
-
-DOCUMENT = "# Title\n\n<!-- table:two_view -->\nold\n<!-- /table -->\n\nafter\n"
 
 
 def test_table_holds_the_numbers_of_its_file(results_dir: Path):
@@ -37,39 +33,6 @@ def test_table_holds_the_numbers_of_its_file(results_dir: Path):
     assert "4 pairs of 1 scenes" in table[-1] and "seed 0" in table[-1]
 
 
-def test_only_what_is_between_the_markers_changes(results_dir: Path):
-    rendered = render_document(DOCUMENT, results_dir)
-    assert rendered.startswith("# Title\n\n<!-- table:two_view -->\n| filter")
-    assert rendered.endswith("\n<!-- /table -->\n\nafter\n")
-    assert "old" not in rendered
-    assert render_document(rendered, results_dir) == rendered
-
-
-def test_table_without_a_file_behind_it_does_not_exist(results_dir: Path):
-    with pytest.raises(InputError, match=r"made_up\.json: not a result file"):
-        render_document(DOCUMENT.replace("two_view", "made_up"), results_dir)
-
-
-@pytest.mark.parametrize(
-    "text", [DOCUMENT.replace("<!-- /table -->", ""), "<!-- /table -->", DOCUMENT + "<!-- table:x -->\n"]
-)
-def test_open_markers_are_refused(results_dir: Path, text: str):
-    with pytest.raises(InputError, match="must alternate"):
-        render_document(text, results_dir, where="README.md")
-
-
-def test_command_renders_and_checks(results_dir: Path, tmp_path: Path):
-    document = tmp_path / "README.md"
-    document.write_text(DOCUMENT)
-    command = ["evaluate", "tables", str(document), "--results-dir", str(results_dir)]
-    failed = CliRunner().invoke(main, [*command, "--check"])
-    assert failed.exit_code == 1 and "tables differ from their results" in failed.output
-    assert document.read_text() == DOCUMENT
-    assert CliRunner().invoke(main, command).exit_code == 0
-    assert "| oracle / poselib |" in document.read_text()
-    assert CliRunner().invoke(main, [*command, "--check"]).exit_code == 0
-
-
 def test_pose_command_prints_json_and_records_itself(results_dir: Path, tmp_path: Path):
     arguments = [
         "evaluate", "pose", str(results_dir / "pairs.h5"), "--method", "ratio0.8/poselib", "--json",
@@ -80,14 +43,6 @@ def test_pose_command_prints_json_and_records_itself(results_dir: Path, tmp_path
     values = json.loads(result.stdout)
     assert list(values["methods"]) == ["ratio0.8/poselib"]
     assert load_results(tmp_path / "r.json")["provenance"]["command"].startswith("corrsfm ")
-
-
-def test_tables_of_the_readme_match_the_results(repository: Path):
-    text = (repository / "README.md").read_text()
-    assert "<!-- table:" in text
-    assert render_document(text, repository / "results", where="README.md") == text, (
-        "run: corrsfm evaluate tables README.md"
-    )
 
 
 @pytest.mark.parametrize("name", ["against_pycolmap", "bench_published"])

@@ -1,6 +1,8 @@
-"""The command-line reference: the captured help of every command, kept as a file so that it cannot rot.
+"""The command-line reference: the help of every command, captured so that it cannot go out of date.
 
-``python -m corrsfm.cli.reference`` writes it anew; a test compares.
+    python tools/reference.py
+
+writes `docs/reference.md`; a test compares the file with the help.
 """
 
 from __future__ import annotations
@@ -10,9 +12,11 @@ from pathlib import Path
 
 import click
 
+from corrsfm.cli import main
+
 __all__ = ["REFERENCE_FILE", "render_reference"]
 
-REFERENCE_FILE = Path(__file__).with_name("REFERENCE.md")
+REFERENCE_FILE = Path(__file__).resolve().parents[1] / "docs" / "reference.md"
 
 
 def _commands(command: click.Command, context: click.Context) -> Iterator[click.Context]:
@@ -26,8 +30,6 @@ def _commands(command: click.Command, context: click.Context) -> Iterator[click.
 
 def render_reference() -> str:
     """The reference as Markdown."""
-    from corrsfm.cli import main
-
     settings = {**main.context_settings, "terminal_width": 100, "max_content_width": 100}
     root = click.Context(main, info_name="corrsfm", **settings)
     sections = [

@@ -1,6 +1,6 @@
 """corrsfm beside plain pycolmap on the same photos: registered photos, points, error and seconds.
 
-    python pipelines/against_pycolmap.py results/against_pycolmap.json SCENE/images …
+    python tools/against_pycolmap.py results/against_pycolmap.json SCENE/images …
 
 Plain pycolmap is `extract_features`, `match_exhaustive` and `incremental_mapping` with its defaults and the
 same number of features; corrsfm is `corrsfm run --method loransac` and, if --methods says so, others. Both
@@ -47,7 +47,7 @@ def timed(command: list[str]) -> tuple[float, float]:
     return round(time.monotonic() - started, 1), round(processor, 1)
 
 
-def largest_model(folder: Path) -> dict[str, float]:
+def largest_model(folder: Path) -> dict[str, float | None]:
     """Counts of the model with most photos below a folder."""
     from corrsfm.colmap.models import summarise_model
 
@@ -101,7 +101,7 @@ def main() -> None:
             "pycolmap",
             {
                 "provenance": provenance(
-                    seed=0, command=" ".join(["python pipelines/against_pycolmap.py", *sys.argv[1:]])
+                    seed=0, command=" ".join(["python tools/against_pycolmap.py", *sys.argv[1:]])
                 ),
                 "subject": {"max_features": arguments.max_features},
                 "rows": rows,

@@ -2,10 +2,10 @@
 # Rebuild the tables of "CorrAdaptor: Adaptive Local Context Learning for Correspondence Pruning" (ECAI 2024)
 # with a checkpoint and data of your own, the paper's numbers printed beside.
 #
-#   pipelines/paper_tables.sh yfcc     yfcc-sift-2000-test.hdf5  CHECKPOINT   tables 1 and 2
-#   pipelines/paper_tables.sh sun3d    sun3d-sift-2000-test.hdf5 CHECKPOINT   table 3
-#   pipelines/paper_tables.sh hpatches hpatches-sequences-release CHECKPOINT  table 4
-#   pipelines/paper_tables.sh ablation yfcc-sift-2000-test.hdf5  CHECKPOINT…  tables 5 to 9
+#   tools/paper_tables.sh yfcc     yfcc-sift-2000-test.hdf5  CHECKPOINT   tables 1 and 2
+#   tools/paper_tables.sh sun3d    sun3d-sift-2000-test.hdf5 CHECKPOINT   table 3
+#   tools/paper_tables.sh hpatches hpatches-sequences-release CHECKPOINT  table 4
+#   tools/paper_tables.sh ablation yfcc-sift-2000-test.hdf5  CHECKPOINT…  tables 5 to 9
 #
 # The HDF5 files are the ones the public tools of OANet make (4,000 pairs of unknown scenes of YFCC100M, 14,872
 # of SUN3D). Results go to results/paper_*.json; what they hold already is not measured again, so a run that was

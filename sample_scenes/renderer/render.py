@@ -4,9 +4,9 @@ A development tool, needed only to make new pictures. In an environment of its o
 `pip install mitsuba opencv-python-headless pillow` (tried with mitsuba 3.9.1, which on a CPU needs LLVM 17 or
 newer; where several are installed, `DRJIT_LIBLLVM_PATH` names the library). A photo takes 10 to 30 s.
 
-    python sample_scenes/render.py courtyard --output sample_scenes/courtyard
-    python sample_scenes/render.py colonnade --spp 20 --output sample_scenes/colonnade
-    python sample_scenes/render.py random --seed 7 --num-photos 8 --output /tmp/place7
+    python sample_scenes/renderer/render.py courtyard --output sample_scenes/courtyard
+    python sample_scenes/renderer/render.py colonnade --spp 20 --output sample_scenes/colonnade
+    python sample_scenes/renderer/render.py random --seed 7 --num-photos 8 --output /tmp/place7
 
 The output folder receives `images/*.jpg` and a COLMAP text model (`cameras.txt`, `images.txt`,
 `points3D.txt`): one PINHOLE camera, world-to-camera poses in metres, pixel centres at +0.5, and surface

@@ -11,7 +11,7 @@ from two_view_pairs import make_pair
 from corrsfm.evaluation.two_view.methods import parse_method
 from corrsfm.labelled.oanet import write_pairs
 
-RECIPE = "pipelines/paper_tables.sh"
+RECIPE = "tools/paper_tables.sh"
 
 
 def _run(repository: Path, folder: Path, *arguments: str) -> subprocess.CompletedProcess:

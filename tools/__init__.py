@@ -1,0 +1,1 @@
+"""What the project uses to write its own documents and to measure itself; not part of the package."""
