@@ -280,7 +280,7 @@ def test_float32_neighbours_are_the_nearest_up_to_rounding(num_padding):
 
 @pytest.mark.parametrize("num_padding", [0, 5])
 def test_neighbours_that_are_well_apart_come_in_exact_order(num_padding):
-    """Whole numbers of mean zero and distances that all differ: exact in float32, in any order of summation."""
+    """Whole numbers of mean zero whose distances all differ: exact in float32, in any order."""
     places = torch.tensor([4.0**power for power in range(5)])
     places = torch.cat([places, -places])
     features = torch.cat([places, torch.zeros(num_padding)])[None, :, None]
