@@ -16,7 +16,13 @@ without a copy.
 
 Pairs of different sizes share a batch through ``mask (B,N) bool``, True on correspondences and False on
 padding; ``None`` means that all rows are correspondences. Every operation that mixes rows takes the mask, so
-a pair's result does not depend on what it is batched with.
+a pair's result does not depend on what it is batched with, but for rounding: products of another shape, or on
+another processor, add their terms in another order. Mostly that shows in the sixth digit of a logit. But
+the network also chooses, and where two candidates almost tie, rounding decides: between the k-th neighbour
+and the next, between two places in the rings of the annular convolution (`nearest_neighbors`), and between
+two matches of almost equal logits at a pruning. A neighbour that flips moves the logit of its own match by up
+to several percent of the scale, and the others a little through the normalisations. How much of this reaches
+the kept matches, `corrsfm.prune.learned.Pruner` says.
 """
 
 from __future__ import annotations
@@ -198,7 +204,9 @@ def linear_norm(x: Tensor, linear: nn.Linear, norm: BatchNorm, mask: Tensor | No
 def nearest_neighbors(features: Tensor, k: int, mask: Tensor | None) -> Tensor:
     """The k nearest correspondences of each in feature space, itself first: (B,N,C) to (B,N,k).
 
-    A pair with fewer than k correspondences repeats each correspondence itself in the missing places.
+    A pair with fewer than k correspondences repeats each correspondence itself in the missing places. In
+    float32 a ranking value is off by up to about 1e-6 of the largest squared feature, so neighbours whose
+    distances differ by less may change places, with the batch or with the processor.
     """
     with full_precision(features), torch.no_grad():
         features = features.to(torch.promote_types(features.dtype, torch.float32))

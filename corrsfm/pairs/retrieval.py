@@ -174,15 +174,25 @@ def most_similar(
             best = np.concatenate([best, similarity], axis=1)
             index = np.concatenate([index, np.broadcast_to(columns, similarity.shape)], axis=1)
             if best.shape[1] > num_neighbours:
-                largest = np.argpartition(-best, num_neighbours - 1, axis=1)[:, :num_neighbours]
-                best = np.take_along_axis(best, largest, axis=1)
-                index = np.take_along_axis(index, largest, axis=1)
+                kept = _largest(best, num_neighbours)
+                best, index = best[kept].reshape(len(rows), -1), index[kept].reshape(len(rows), -1)
         order = np.lexsort((index, -best), axis=1)
         best = np.take_along_axis(best, order, axis=1)
         index = np.take_along_axis(index, order, axis=1)
         for row, similarities, neighbours in zip(rows, best, index, strict=True):
             result[row] = neighbours[np.isfinite(similarities)]
     return result
+
+
+def _largest(values: NDArray[np.float32], num: int) -> NDArray[np.bool_]:
+    """(N, M) bool: the ``num`` largest of each row, the first ones among equals.
+
+    `numpy.argpartition` alone takes any of the equals, which ones depends on the processor.
+    """
+    last = -np.partition(-values, num - 1, axis=1)[:, num - 1 : num]
+    above, level = values > last, values == last
+    room = num - np.count_nonzero(above, axis=1, keepdims=True)
+    return above | (level & (np.cumsum(level, axis=1, dtype=np.int32) <= room))
 
 
 def _unit(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:

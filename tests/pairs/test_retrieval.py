@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from corrsfm.pairs import retrieval
-from corrsfm.pairs.retrieval import aggregate, global_vectors, most_similar, train_vocabulary
+from corrsfm.pairs.retrieval import Vocabulary, aggregate, global_vectors, most_similar
 
 
 def scene(num_places: int, num_views: int, seed: int = 0) -> dict[str, NDArray[np.uint8]]:
@@ -38,13 +38,32 @@ def test_vectors_repeat_exactly_and_have_unit_length() -> None:
     np.testing.assert_allclose(np.linalg.norm(vectors[0].astype(np.float64), axis=1), 1.0, atol=1e-3)
 
 
+def unit_vectors(descriptors: NDArray[np.uint8]) -> NDArray[np.float64]:
+    return descriptors / np.linalg.norm(descriptors.astype(np.float64), axis=1, keepdims=True)
+
+
 def test_the_order_of_descriptors_does_not_matter() -> None:
     photos = scene(2, 2)
-    vocabulary = train_vocabulary(np.concatenate(list(photos.values())), seed=0)
-    descriptors = photos["0/0"]
-    np.testing.assert_allclose(
-        aggregate(descriptors, vocabulary), aggregate(descriptors[::-1], vocabulary), atol=1e-5
+    words = unit_vectors(photos["1/0"][:8])[:, :32]
+    vocabulary = Vocabulary(
+        mean=np.zeros(128, np.float32),
+        directions=np.eye(128, 32, dtype=np.float32),
+        words=words.astype(np.float32),
     )
+    # Without those between two words, where rounding would decide.
+    points = unit_vectors(photos["0/0"])[:, :32]
+    distances = ((points[:, None] - words) ** 2).sum(-1)
+    clear = np.diff(np.sort(distances, axis=1)[:, :2])[:, 0] > 1e-4
+    assert clear.sum() > 100
+    one_hot = (distances.argmin(axis=1) == np.arange(8)[:, None])[:, clear]
+    counts = one_hot.sum(axis=1)
+    lengths = np.linalg.norm(one_hot @ points[clear] - counts[:, None] * words, axis=1)[counts > 0]
+    # Each order is off by at most u · terms of the sum of absolute values; then the length divides it.
+    bound = 2 * 2.0**-24 * counts.max() * (one_hot @ np.abs(points[clear])).max() / lengths.min()
+    assert bound < 1e-4
+    descriptors = photos["0/0"][clear]
+    one, other = aggregate(descriptors, vocabulary), aggregate(descriptors[::-1], vocabulary)
+    np.testing.assert_allclose(one, other, atol=bound, rtol=0)
 
 
 def test_photos_without_descriptors_are_nobodys_neighbour() -> None:
@@ -99,13 +118,20 @@ def test_the_vocabulary_is_learned_from_a_bounded_sample(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("block_size", [1, 7, 1000])
 @pytest.mark.parametrize("num_neighbours", [1, 5, 60])
 def test_blocked_search_equals_a_plain_one(block_size: int, num_neighbours: int) -> None:
-    vectors = np.random.default_rng(0).standard_normal((40, 6))
+    # Small whole numbers: dot products are exact in any order, and equal ones come by index.
+    vectors = np.random.default_rng(0).integers(-9, 10, (40, 6)).astype(np.float32)
     similarity = vectors @ vectors.T
     np.fill_diagonal(similarity, -np.inf)
     found = most_similar(vectors, num_neighbours, block_size=block_size)
     for row, neighbours in enumerate(found):
-        expected = np.argsort(-similarity[row])[: min(num_neighbours, 39)]
+        expected = np.argsort(-similarity[row], kind="stable")[: min(num_neighbours, 39)]
         np.testing.assert_array_equal(neighbours, expected)
+
+
+def test_equally_similar_photos_come_by_their_index_where_the_list_is_cut() -> None:
+    vectors = np.ones((30, 4), np.float32)
+    for row, neighbours in enumerate(most_similar(vectors, 3, block_size=7)):
+        assert neighbours.tolist() == [other for other in range(4) if other != row][:3]
 
 
 @pytest.mark.slow

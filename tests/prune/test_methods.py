@@ -116,8 +116,9 @@ def test_result_of_a_pair_does_not_depend_on_the_others(pruner):
     pairs = [make(0), make(1, num=0), make(2, num=150, inlier_ratio=0.3), make(3, num=40)]
     for pair, together in zip(pairs, pruner(pairs), strict=True):
         (alone,) = pruner([pair])
+        # On a CPU no method computes pairs together, so not even rounding may differ.
         np.testing.assert_array_equal(alone.inlier_mask, together.inlier_mask)
-        np.testing.assert_allclose(alone.scores, together.scores, atol=1e-4)
+        np.testing.assert_array_equal(alone.scores, together.scores)
 
 
 def test_pruner_keeps_order_of_matches(pruner):

