@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "INLIER_THRESHOLD",
     "angle_between_deg",
     "cross_matrix",
     "essential_from_pose",
@@ -19,6 +20,13 @@ __all__ = [
     "symmetric_epipolar_distance_sq",
     "wrap_angles",
 ]
+
+INLIER_THRESHOLD = 1e-4
+"""Squared symmetric epipolar distance below which a match is an inlier, in normalised coordinates.
+
+The pruning literature labels matches with it and scores methods by it, from Yi et al., "Learning to Find Good
+Correspondences" (CVPR 2018) on. At a focal length of 1000 px such a match is about 7 px off each line.
+"""
 
 
 def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:

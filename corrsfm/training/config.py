@@ -10,6 +10,7 @@ from typing import Any
 from corrsfm.config import from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
+from corrsfm.geometry import INLIER_THRESHOLD
 
 __all__ = [
     "AugmentConfig",
@@ -92,7 +93,9 @@ class TrainConfig:
     weight_decay: float = option(1e-4, "Decoupled weight decay of AdamW", minimum=0)
     max_gradient_norm: float = option(1.0, "Gradients are scaled down to this length", minimum=0)
     ema_decay: float = option(0.999, "Decay of the moving average of the weights; 0 for none", minimum=0)
-    threshold: float = option(1e-4, "Largest squared symmetric epipolar distance of a right match", minimum=0)
+    threshold: float = option(
+        INLIER_THRESHOLD, "Largest squared symmetric epipolar distance of a right match", minimum=0
+    )
     essential_start: float = option(0.05, "Share of the run without the essential loss", minimum=0)
     essential_weight: float = option(0.5, "Weight of the essential loss", minimum=0)
     bfloat16: bool = option(False, "Compute in bfloat16 where that is safe")

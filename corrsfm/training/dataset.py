@@ -16,11 +16,11 @@ import torch
 from torch import Tensor
 
 from corrsfm.errors import InputError
-from corrsfm.geometry import essential_from_pose, relative_pose
+from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
 from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
 from corrsfm.training.config import AugmentConfig
-from corrsfm.training.losses import THRESHOLD, epipolar_distance_sq
+from corrsfm.training.losses import epipolar_distance_sq
 
 __all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_channels"]
 
@@ -58,6 +58,10 @@ class Batch:
     def distances(self) -> Tensor:
         """Squared symmetric epipolar distances (B, N) to the truth."""
         return epipolar_distance_sq(self.matrix, self.true_correspondences)
+
+    def inliers(self) -> Tensor:
+        """Matches (B, N) that agree with the truth; False for padding."""
+        return (self.distances() < INLIER_THRESHOLD) & self.mask
 
     def __len__(self) -> int:
         return len(self.matrix)
@@ -154,7 +158,7 @@ class RealPairs:
             pairs = torch.arange(start, min(start + 64, self.num_pairs), device=self.device)
             width = int(self._arrays["num_matches"][pairs].max())
             batch = self._gather(pairs, torch.arange(width, device=self.device).expand(len(pairs), -1))
-            right = (batch.distances() < THRESHOLD) & batch.mask
+            right = batch.inliers()
             counts.append(right.sum(1))
             ratios.append(right.sum(1) / batch.mask.sum(1).clamp(min=1))
         return torch.cat(ratios), torch.cat(counts)
@@ -207,7 +211,7 @@ class RealPairs:
         columns = torch.arange(width, device=self.device)
         if config.thin_probability > 0:
             batch = self._gather(pairs, columns.expand(num_pairs, -1))
-            right = batch.distances() < THRESHOLD
+            right = batch.inliers()
             draw = torch.rand(num_pairs, 2, 1, device=self.device, generator=generator)
             keep = torch.where(draw[:, 0] < config.thin_probability, 0.15 + 0.85 * draw[:, 1], 1.0)
             thinned = right & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from corrsfm.geometry import INLIER_THRESHOLD
+
 __all__ = ["classification_loss", "epipolar_distance_sq", "essential_loss", "virtual_points"]
 
-THRESHOLD = 1e-4
-"""τ: largest squared symmetric epipolar distance of a right match."""
 MARGIN = 0.1
 """Distances of virtual points count up to here."""
 
@@ -20,7 +20,7 @@ def classification_loss(
     logits: Sequence[Tensor],
     distances: Sequence[Tensor],
     mask: Sequence[Tensor] | None = None,
-    threshold: float = THRESHOLD,
+    threshold: float = INLIER_THRESHOLD,
 ) -> Tensor:
     """Binary cross entropy with adaptive temperature, summed over the pruning steps.
 
@@ -33,7 +33,7 @@ def classification_loss(
     mask : sequence of (B, N_s) bool tensors, optional
         False for padding, which counts nowhere.
     threshold : float
-        τ of the paper.
+        τ of the paper: largest distance of an inlier.
 
     Returns
     -------

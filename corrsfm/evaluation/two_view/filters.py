@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from corrsfm.config import OperatingPoint, PruneConfig, PruneMethod
 from corrsfm.errors import ConfigError
+from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import PruneResult
 
@@ -85,7 +86,7 @@ class SideFilter:
 class OracleFilter:
     """Keep exactly the right matches: what a perfect filter would leave, the ceiling of all others."""
 
-    threshold: float = 1e-4
+    threshold: float = INLIER_THRESHOLD
     name: str = "oracle"
 
     @property

@@ -23,7 +23,12 @@ from corrsfm.evaluation.metrics import (
 from corrsfm.evaluation.records import kept_methods, provenance, save_results
 from corrsfm.evaluation.two_view.methods import MethodOutput, TwoViewMethod, parse_method
 from corrsfm.files import sha256_of
-from corrsfm.geometry import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_sq
+from corrsfm.geometry import (
+    INLIER_THRESHOLD,
+    essential_from_pose,
+    pose_error_deg,
+    symmetric_epipolar_distance_sq,
+)
 from corrsfm.labelled.compact import is_compact, read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair, read_pairs
 
@@ -37,7 +42,6 @@ __all__ = [
 ]
 
 POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-INLIER_THRESHOLD = 1e-4
 _BATCH = 8
 
 _PER_PAIR = (
@@ -83,8 +87,8 @@ class PairScores:
     precision, recall, f_score : (P,) float64
         Percent; of the matches the filter keeps.
     pose_precision, pose_recall, pose_f_score : (P,) float64
-        Percent; of all matches closer than 1e-4 to the estimated pose, the convention of papers that judge
-        the network's essential matrix.
+        Percent; of all matches within `INLIER_THRESHOLD` of the estimated pose, as papers do that judge the
+        network's essential matrix.
     num_kept : (P,) float64
     filter_seconds, estimator_seconds : (P,) float64
     """
@@ -108,7 +112,7 @@ class PairScores:
 
 
 def _score_one(pair: OANetPair, output: MethodOutput) -> dict[str, float]:
-    inliers = pair.inliers(INLIER_THRESHOLD)
+    inliers = pair.inliers()
     kept = precision_recall_f(output.result.inlier_mask, inliers)
     rotation_error = translation_error = math.inf
     by_pose = (0.0, 0.0, 0.0)
