@@ -19,8 +19,8 @@ from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
 from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
+from corrsfm.model.network import symmetric_epipolar_squared
 from corrsfm.training.config import AugmentConfig
-from corrsfm.training.losses import epipolar_distance_sq
 
 __all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_channels"]
 
@@ -57,7 +57,7 @@ class Batch:
 
     def distances(self) -> Tensor:
         """Squared symmetric epipolar distances (B, N) to the truth."""
-        return epipolar_distance_sq(self.matrix, self.true_correspondences)
+        return symmetric_epipolar_squared(self.true_correspondences, self.matrix)
 
     def inliers(self) -> Tensor:
         """Matches (B, N) that agree with the truth; False for padding."""
