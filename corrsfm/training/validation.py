@@ -31,10 +31,7 @@ def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) ->
             torch.from_numpy(pair.correspondences)[None].to(device),
             torch.from_numpy(side)[None].to(device) if network.side_channels else None,
         )
-        logits = torch.full((1, len(pair)), -torch.inf, device=device)
-        for values, indices in zip(output.logits, output.indices, strict=True):
-            logits.scatter_(1, indices, values.float())
-    return logits[0].sigmoid().cpu().numpy()
+    return output.last_logits()[0].sigmoid().cpu().numpy()
 
 
 def pose_error_after_loransac(pair: OANetPair, kept: NDArray, max_error_px: float = 1.0) -> float:
