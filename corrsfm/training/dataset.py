@@ -20,9 +20,10 @@ from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pos
 from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
 from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
 from corrsfm.model.network import symmetric_epipolar_squared
+from corrsfm.prune.correspondences import side_channels
 from corrsfm.training.config import AugmentConfig
 
-__all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_channels"]
+__all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_information"]
 
 # A pair with fewer right matches has no label worth learning from.
 _MIN_INLIERS = 20
@@ -75,18 +76,9 @@ def concatenate(batches: Sequence[Batch]) -> Batch:
     return Batch(**columns)
 
 
-def side_channels(batch: Batch, num_channels: int) -> Tensor | None:
-    """Side information (B, N, S) as `corrsfm.prune.side_information` lays it out, or None for no channels."""
-    if num_channels == 0:
-        return None
-    channels = [
-        batch.ratios,
-        batch.mutual,
-        batch.log_scale_ratios.clamp(-3.0, 3.0),
-        batch.rotations.cos(),
-        batch.rotations.sin(),
-    ]
-    return torch.stack(channels[:num_channels], dim=-1)
+def side_information(batch: Batch, num_channels: int) -> Tensor | None:
+    """Side information (B, N, S) as `corrsfm.prune.correspondences` lays it out; None for no channels."""
+    return side_channels(batch, num_channels, torch) if num_channels else None
 
 
 _BATCH_FIELDS = tuple(entry.name for entry in fields(Batch))
