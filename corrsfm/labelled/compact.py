@@ -36,10 +36,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import normalise_by_pinhole
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
-from corrsfm.labelled.oanet import OANetPair, open_pairs, pinhole_parameters, select_per_scene
+from corrsfm.labelled.oanet import OANetPair, open_pairs, select_per_scene
 from corrsfm.types import Camera
 
 __all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
@@ -100,8 +101,7 @@ class CompactScene:
     def normalised(self, image: int, *, undistorted: bool) -> NDArray[np.float64]:
         """Normalised keypoints (N, 2) of one photo, by the pinhole part of its camera or the full model."""
         rows = slice(*self.keypoint_offsets[image : image + 2])
-        fx, fy, cx, cy = pinhole_parameters(self.cameras[image])
-        points = (self.keypoints[rows] - np.array([cx, cy])) / np.array([fx, fy])
+        points = normalise_by_pinhole(self.cameras[image], self.keypoints[rows])
         return points + self.corrections[rows] if undistorted else points
 
     def matched(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -25,6 +25,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
 from corrsfm.geometry import INLIER_THRESHOLD
@@ -33,7 +34,6 @@ from corrsfm.types import Camera, Correspondences
 __all__ = [
     "OANetPair",
     "open_pairs",
-    "pinhole_parameters",
     "read_pairs",
     "select_per_scene",
     "write_pairs",
@@ -127,14 +127,6 @@ class OANetPair:
             camera1=self.camera1,
             name=self.name,
         )
-
-
-def pinhole_parameters(camera: Camera) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point ``fx fy cx cy`` in pixels: a camera without its distortion."""
-    params = camera.params
-    if camera.model.startswith(("SIMPLE_", "RADIAL")):
-        return params[0], params[0], params[1], params[2]
-    return params[0], params[1], params[2], params[3]
 
 
 def _to_pixels(camera: Camera, normalised: NDArray[np.float32]) -> NDArray[np.float32]:

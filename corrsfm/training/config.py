@@ -11,6 +11,7 @@ from corrsfm.config import from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
 from corrsfm.geometry import INLIER_THRESHOLD
+from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
 
 __all__ = [
     "AugmentConfig",
@@ -60,7 +61,9 @@ class AugmentConfig:
         0.01, "Standard deviation of a principal point in focal lengths", minimum=0
     )
     unknown_focal_probability: float = option(
-        0.15, "Use 1.2 times the longest side as the focal length, as where nothing is known", minimum=0
+        0.15,
+        f"Use {DEFAULT_FOCAL_FACTOR} times the longest side as the focal length, as where nothing is known",
+        minimum=0,
     )
     thin_probability: float = option(0.3, "Drop up to 85 % of the right matches", minimum=0)
 

@@ -15,10 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
+from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
 from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
-from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
+from corrsfm.labelled.oanet import OANetPair, read_pairs
 from corrsfm.model.network import symmetric_epipolar_squared
 from corrsfm.prune.correspondences import side_channels
 from corrsfm.training.config import AugmentConfig
@@ -281,9 +283,9 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
 
 
 def _guess_factor(scene: CompactScene, image: int) -> float:
-    """True focal length over the one that is assumed when nothing is known, 1.2 times the longest side."""
+    """True focal length over the one that is assumed where nothing is known."""
     camera = scene.cameras[image]
-    return pinhole_parameters(camera)[0] / (1.2 * max(camera.width, camera.height))
+    return pinhole_parameters(camera)[0] / (DEFAULT_FOCAL_FACTOR * max(camera.width, camera.height))
 
 
 def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch.Generator) -> Batch:

@@ -19,12 +19,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
+from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_by_pinhole, normalise_points
 from corrsfm.errors import ImageError, InputError, WorkspaceError
 from corrsfm.features.sift import extract_features
 from corrsfm.images.photos import read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
-from corrsfm.labelled.oanet import pinhole_parameters, write_pairs
+from corrsfm.labelled.oanet import write_pairs
 from corrsfm.matches.nearest import match_features
 from corrsfm.training.config import PrepareConfig
 from corrsfm.types import Camera, Features
@@ -228,13 +228,10 @@ def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
 
 def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:
     """Undistorted minus pinhole normalised coordinates (N, 2)."""
-    fx, fy, cx, cy = pinhole_parameters(camera)
-    pixels = keypoints.astype(np.float64)
-    undistorted = normalise_points(camera, pixels)
     # A model of strong distortion may have no ray for a corner of the photo; such a point keeps its pinhole
     # ray, its label is then "far from the line", which is what inference would find too.
-    pinhole = (pixels - [cx, cy]) / [fx, fy]
-    return np.nan_to_num(undistorted - pinhole, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    corrections = normalise_points(camera, keypoints) - normalise_by_pinhole(camera, keypoints)
+    return np.nan_to_num(corrections, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
 
 
 def _read_model(folder: Path) -> _SceneModel:
