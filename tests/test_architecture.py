@@ -45,7 +45,7 @@ OWNERS: dict[str, set[str]] = {
     "h5py": {"workspace", "labelled", "training"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "evaluation", "training",
+        "evaluation",
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from corrsfm.geometry import angle_between_deg, relative_pose, rotation_angle_deg
+from corrsfm.geometry import Pose, angle_between_deg, camera_centre, relative_pose, rotation_angle_deg
 
 __all__ = [
     "Interval",
@@ -232,10 +232,6 @@ def position_errors(positions: ArrayLike, truth: ArrayLike) -> NDArray[np.float6
     return np.linalg.norm(aligned - np.asarray(truth, np.float64), axis=1)
 
 
-Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Rotation (3, 3) and translation (3,) of ``cam_from_world``."""
-
-
 def relative_pose_errors(
     poses: Mapping[str, Pose], truth: Mapping[str, Pose], pairs: Sequence[tuple[str, str]] | None = None
 ) -> NDArray[np.float64]:
@@ -260,7 +256,7 @@ def relative_pose_errors(
     names = sorted(truth)
     if pairs is None:
         pairs = [(first, second) for i, first in enumerate(names) for second in names[i + 1 :]]
-    centres = np.array([-rotation.T @ translation for rotation, translation in truth.values()])
+    centres = np.array([camera_centre(pose) for pose in truth.values()])
     extent = float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) else 0.0
     errors = np.full(len(pairs), np.inf)
     for index, (first, second) in enumerate(pairs):

@@ -231,11 +231,10 @@ def _finite(value: float) -> float | None:
 
 
 def _models(workspace: Workspace) -> list[ModelSummary]:
-    """Summaries of the models, the largest first."""
+    """Summaries of the models, the largest first: mapping has ranked them."""
     from corrsfm.colmap.models import read_models, summarise_model
 
-    summaries = [summarise_model(model) for model in read_models(workspace.sparse)]
-    return sorted(summaries, key=lambda model: -model.num_images)
+    return [summarise_model(model) for model in read_models(workspace.sparse)]
 
 
 def _seconds(workspace: Workspace, stage: str) -> float | None:
