@@ -7,6 +7,7 @@ treatment of distortion. Thresholds are pixels of the original photos unless a d
 from __future__ import annotations
 
 import importlib.metadata
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,7 +18,8 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import mean_focal_px, normalise_points, to_pycolmap
 from corrsfm.errors import ConfigError, DependencyError
-from corrsfm.geometry import symmetric_epipolar_distance_sq
+from corrsfm.geometry import pose_error_deg, symmetric_epipolar_distance_sq
+from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import Correspondences, PruneResult
 
 __all__ = [
@@ -26,6 +28,7 @@ __all__ = [
     "PoseEstimator",
     "estimator_fingerprint",
     "parse_estimator",
+    "pose_errors_deg",
     "weighted_eight_point",
 ]
 
@@ -57,6 +60,13 @@ class PoseEstimate:
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     inlier_mask: NDArray[np.bool_]
+
+
+def pose_errors_deg(pose: PoseEstimate | None, pair: OANetPair) -> tuple[float, float]:
+    """Rotation and translation error of an estimate in degrees; both infinite without one."""
+    if pose is None:
+        return math.inf, math.inf
+    return pose_error_deg(pose.rotation, pose.translation, pair.rotation, pair.translation)
 
 
 PoseEstimator = Callable[[Correspondences, PruneResult, int], PoseEstimate | None]

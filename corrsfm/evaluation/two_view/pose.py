@@ -21,14 +21,10 @@ from corrsfm.evaluation.metrics import (
     precision_recall_f,
 )
 from corrsfm.evaluation.records import kept_methods, provenance, save_results
+from corrsfm.evaluation.two_view.estimators import pose_errors_deg
 from corrsfm.evaluation.two_view.methods import MethodOutput, TwoViewMethod, parse_method
 from corrsfm.files import sha256_of
-from corrsfm.geometry import (
-    INLIER_THRESHOLD,
-    essential_from_pose,
-    pose_error_deg,
-    symmetric_epipolar_distance_sq,
-)
+from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, symmetric_epipolar_distance_sq
 from corrsfm.labelled.compact import is_compact, read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair, read_pairs
 
@@ -114,20 +110,13 @@ class PairScores:
 def _score_one(pair: OANetPair, output: MethodOutput) -> dict[str, float]:
     inliers = pair.inliers()
     kept = precision_recall_f(output.result.inlier_mask, inliers)
-    rotation_error = translation_error = math.inf
     by_pose = (0.0, 0.0, 0.0)
     if output.pose is not None:
-        rotation, translation = output.pose.rotation, output.pose.translation
-        rotation_error, translation_error = pose_error_deg(
-            rotation, translation, pair.rotation, pair.translation
-        )
-        distances = symmetric_epipolar_distance_sq(
-            essential_from_pose(rotation, translation), pair.correspondences
-        )
+        essential = essential_from_pose(output.pose.rotation, output.pose.translation)
+        distances = symmetric_epipolar_distance_sq(essential, pair.correspondences)
         by_pose = precision_recall_f(distances < INLIER_THRESHOLD, inliers)
     values = (
-        rotation_error,
-        translation_error,
+        *pose_errors_deg(output.pose, pair),
         *kept,
         *by_pose,
         float(output.result.inlier_mask.sum()),
