@@ -21,6 +21,7 @@ __all__ = [
     "SIDE_CHANNELS",
     "SIDE_LAYOUTS",
     "correspondences_from_points",
+    "distinctiveness",
     "make_correspondences",
     "side_channels",
     "side_information",
@@ -142,6 +143,11 @@ def _pinhole(matrix: ArrayLike, points: NDArray[np.float32]) -> Camera:
     finite = points[np.isfinite(points).all(axis=1)]
     width, height = np.ceil(finite.max(axis=0, initial=1.0)).astype(int)
     return Camera.from_matrix(matrix, int(width), int(height))
+
+
+def distinctiveness(ratios: NDArray[np.floating]) -> NDArray[np.float32]:
+    """One minus the ratio of the two nearest descriptor distances, in [0, 1]; 0 where the ratio is NaN."""
+    return np.clip(1.0 - np.nan_to_num(ratios, nan=1.0), 0.0, 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,7 +19,7 @@ from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
-from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
+from corrsfm.labelled.compact import RATIO_STEPS, CompactScene, is_compact, quantise_ratios, read_scenes
 from corrsfm.labelled.oanet import OANetPair, read_pairs
 from corrsfm.model.network import symmetric_epipolar_squared
 from corrsfm.prune.correspondences import side_channels
@@ -185,7 +185,7 @@ class RealPairs:
             correspondences=pinhole,
             true_correspondences=pinhole + torch.cat([a["corrections"][key0], a["corrections"][key1]], -1),
             matrix=a["matrix"][pairs],
-            ratios=a["ratios"][rows].float() / 255.0,
+            ratios=a["ratios"][rows].float() / RATIO_STEPS,
             mutual=a["mutual"][rows].float(),
             log_scale_ratios=(a["log_scales"][key1] - a["log_scales"][key0]).float(),
             rotations=a["orientations"][key1] - a["orientations"][key0],
@@ -230,7 +230,7 @@ def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str
         "orientations": np.concatenate([zeros, pair.rotations]),
         "key0": rows.astype(dtype),
         "key1": (rows + num).astype(dtype),
-        "ratios": np.round(np.clip(pair.ratios, 0, 1) * 255.0).astype(np.uint8),
+        "ratios": quantise_ratios(pair.ratios),
         "mutual": pair.mutual,
         "num_matches": np.array([num]),
         "match_start": np.array([first_match]),
@@ -273,7 +273,7 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
         "orientations": scene.orientations,
         "key0": key[0],
         "key1": key[1],
-        "ratios": np.round(scene.ratios[rows] * 255.0).astype(np.uint8),
+        "ratios": quantise_ratios(scene.ratios[rows]),
         "mutual": scene.mutual[rows],
         "num_matches": counts,
         "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
