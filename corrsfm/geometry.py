@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "INLIER_THRESHOLD",
+    "Pose",
     "angle_between_deg",
+    "camera_centre",
     "cross_matrix",
     "essential_from_pose",
     "pose_error_deg",
@@ -19,6 +22,23 @@ __all__ = [
     "symmetric_epipolar_distance_sq",
     "wrap_angles",
 ]
+
+INLIER_THRESHOLD = 1e-4
+"""Squared symmetric epipolar distance below which a match is an inlier, in normalised coordinates.
+
+The pruning literature labels matches with it and scores methods by it, from Yi et al., "Learning to Find Good
+Correspondences" (CVPR 2018) on. At a focal length of 1000 px such a match is about 7 px off each line.
+"""
+
+
+Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Rotation (3, 3) and translation (3,) of ``cam_from_world``."""
+
+
+def camera_centre(pose: Pose) -> NDArray[np.float64]:
+    """Centre (3,) of a camera in the world, from its ``cam_from_world``."""
+    rotation, translation = pose
+    return -rotation.T @ translation
 
 
 def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:

@@ -46,16 +46,16 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
 # The rooms that may import a third-party package.
 OWNERS: dict[str, set[str]] = {
     "cv2": {"images", "features", "report", "prune", "evaluation"},
-    "h5py": {"workspace", "labelled", "training"},
+    "h5py": {"workspace", "labelled"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "evaluation", "training",
+        "evaluation",
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},
     "tqdm": {"cli", "workspace", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},
-    "poselib": {"evaluation", "training"},
+    "poselib": {"evaluation"},
 }  # fmt: skip
 
 

@@ -7,12 +7,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.types import Camera
+from corrsfm.errors import InputError
+from corrsfm.types import CAMERA_PARAMETERS, Camera
 
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["camera_from_pycolmap", "normalise_points", "to_pycolmap"]
+__all__ = [
+    "camera_from_pycolmap",
+    "mean_focal_px",
+    "normalise_by_pinhole",
+    "normalise_points",
+    "pinhole_parameters",
+    "to_pycolmap",
+]
 
 
 def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
@@ -38,6 +46,32 @@ def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
         params=tuple(float(value) for value in camera.params),
         has_prior_focal_length=bool(camera.has_prior_focal_length),
     )
+
+
+def mean_focal_px(camera0: Camera, camera1: Camera) -> float:
+    """Mean focal length of the two cameras of a pair in pixels, x and y alike."""
+    return float(np.mean([to_pycolmap(camera).mean_focal_length() for camera in (camera0, camera1)]))
+
+
+def pinhole_parameters(camera: Camera) -> tuple[float, float, float, float]:
+    """Focal lengths and principal point ``fx fy cx cy`` in pixels: the camera without its distortion.
+
+    Raises
+    ------
+    InputError
+        If a camera of this model has no focal length.
+    """
+    named = dict(zip(CAMERA_PARAMETERS[camera.model].split(), camera.params, strict=True))
+    if "cx" not in named:
+        raise InputError(f"camera of model {camera.model}: has no focal length; expected a perspective model")
+    fx, fy = (named.get(name, named.get("f", 0.0)) for name in ("fx", "fy"))
+    return fx, fy, named["cx"], named["cy"]
+
+
+def normalise_by_pinhole(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Normalised coordinates (N, 2) of pixels (N, 2) by `pinhole_parameters`; distortion stays in them."""
+    fx, fy, cx, cy = pinhole_parameters(camera)
+    return (points - np.array([cx, cy])) / np.array([fx, fy])
 
 
 def normalise_points(camera: Camera, points: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Reading COLMAP models and summarising them in numbers."""
+"""Finding COLMAP models, reading them and their poses, and summarising them in numbers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,75 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.geometry import Pose
 from corrsfm.types import ModelSummary
 
-__all__ = ["observation_errors", "read_models", "summarise_model"]
+__all__ = [
+    "find_model",
+    "is_model",
+    "observation_errors",
+    "poses_of",
+    "read_model",
+    "read_models",
+    "summarise_model",
+]
+
+# Where a folder may keep its model: a workspace's first one, COLMAP's own habits.
+_PLACES = (".", "sparse/0", "sparse", "model", "0")
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder is a COLMAP model, binary or text."""
+    # A workspace has an images.txt too, the list of its photos.
+    return any(
+        (folder / f"cameras{suffix}").exists() and (folder / f"images{suffix}").exists()
+        for suffix in (".bin", ".txt")
+    )
+
+
+def find_model(folder: Path) -> Path:
+    """The model in a folder: the folder itself, or in its ``sparse/0``, ``sparse``, ``model`` or ``0``.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    for place in _PLACES:
+        if is_model(folder / place):
+            return folder / place
+    raise InputError(
+        f"{folder}: holds no COLMAP model (cameras and images, .bin or .txt) and no sparse/0, sparse or "
+        f"model with one; for a workspace run: corrsfm reconstruct {folder}"
+    )
+
+
+def read_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model that the user handed in.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    try:
+        with colmap_log():
+            return pycolmap.Reconstruction(str(folder))
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{folder}: COLMAP model cannot be read ({error})") from error
+
+
+def poses_of(model: pycolmap.Reconstruction) -> dict[str, Pose]:
+    """Poses of the registered photos by name, sorted."""
+    poses = {}
+    for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name):
+        pose = image.cam_from_world()
+        poses[image.name] = (
+            np.asarray(pose.rotation.matrix(), np.float64),
+            np.asarray(pose.translation, np.float64),
+        )
+    return poses
 
 
 def read_models(folder: Path) -> list[pycolmap.Reconstruction]:

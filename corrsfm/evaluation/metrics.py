@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from corrsfm.geometry import angle_between_deg, relative_pose, rotation_angle_deg
+from corrsfm.geometry import Pose, angle_between_deg, camera_centre, relative_pose, rotation_angle_deg
 
 __all__ = [
+    "POSE_THRESHOLDS_DEG",
     "Interval",
     "align_similarity",
     "auc_contributions",
@@ -32,6 +33,10 @@ __all__ = [
 ]
 
 
+POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
+"""Thresholds of the pose error that papers report."""
+
+
 def _errors(errors: ArrayLike) -> NDArray[np.float64]:
     values = np.asarray(errors, np.float64).ravel()
     if len(values) == 0:
@@ -41,7 +46,7 @@ def _errors(errors: ArrayLike) -> NDArray[np.float64]:
     return values
 
 
-def pose_auc(errors: ArrayLike, thresholds: Sequence[float] = (5.0, 10.0, 20.0)) -> list[float]:
+def pose_auc(errors: ArrayLike, thresholds: Sequence[float] = POSE_THRESHOLDS_DEG) -> list[float]:
     """Exact area under the recall curve, by the trapezoid rule.
 
     The curve runs through (0, 0) and (e_i, i / n) for the sorted errors e_i, and stays level from the last
@@ -79,7 +84,7 @@ def auc_contributions(errors: ArrayLike, threshold: float) -> NDArray[np.float64
     return 100.0 * np.clip(1.0 - _errors(errors) / threshold, 0.0, 1.0)
 
 
-def pose_map(errors: ArrayLike, thresholds: Sequence[float] = (5.0, 10.0, 20.0)) -> list[float]:
+def pose_map(errors: ArrayLike, thresholds: Sequence[float] = POSE_THRESHOLDS_DEG) -> list[float]:
     """Mean over 5, 10, … threshold degrees of the percentage of pairs below that many degrees."""
     values = _errors(errors)
     scores = []
@@ -232,10 +237,6 @@ def position_errors(positions: ArrayLike, truth: ArrayLike) -> NDArray[np.float6
     return np.linalg.norm(aligned - np.asarray(truth, np.float64), axis=1)
 
 
-Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Rotation (3, 3) and translation (3,) of ``cam_from_world``."""
-
-
 def relative_pose_errors(
     poses: Mapping[str, Pose], truth: Mapping[str, Pose], pairs: Sequence[tuple[str, str]] | None = None
 ) -> NDArray[np.float64]:
@@ -260,7 +261,7 @@ def relative_pose_errors(
     names = sorted(truth)
     if pairs is None:
         pairs = [(first, second) for i, first in enumerate(names) for second in names[i + 1 :]]
-    centres = np.array([-rotation.T @ translation for rotation, translation in truth.values()])
+    centres = np.array([camera_centre(pose) for pose in truth.values()])
     extent = float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) else 0.0
     errors = np.full(len(pairs), np.inf)
     for index, (first, second) in enumerate(pairs):

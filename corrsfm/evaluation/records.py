@@ -8,16 +8,31 @@ only what is new or changed.
 from __future__ import annotations
 
 import json
+import math
 import platform
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from corrsfm.errors import InputError
+from corrsfm.evaluation.metrics import POSE_THRESHOLDS_DEG, Interval, auc_contributions, bootstrap_mean
 from corrsfm.files import atomic_write_text
 from corrsfm.machine import count_threads, versions
 
-__all__ = ["kept_methods", "load_results", "provenance", "save_results"]
+__all__ = [
+    "auc_intervals",
+    "by_threshold",
+    "finite_or_none",
+    "kept_methods",
+    "load_results",
+    "provenance",
+    "rounded_interval",
+    "save_results",
+]
 
 FORMAT_VERSION = 1
 _LIBRARIES = ("numpy", "opencv-python-headless", "pycolmap", "poselib", "torch", "h5py")
@@ -36,6 +51,35 @@ def provenance(*, seed: int, command: str = "", device: str = "cpu") -> dict[str
         "seed": seed,
         "command": command,
     }
+
+
+def by_threshold(
+    scores: Sequence[float], thresholds: Sequence[float] = POSE_THRESHOLDS_DEG
+) -> dict[str, float]:
+    """Scores by threshold, as result files hold them."""
+    return {f"{t:g}": round(score, 3) for t, score in zip(thresholds, scores, strict=True)}
+
+
+def rounded_interval(interval: Interval) -> list[float]:
+    """Mean, lower and upper end of an interval, as result files hold them."""
+    return [round(value, 3) for value in (interval.mean, interval.low, interval.high)]
+
+
+def auc_intervals(
+    errors: NDArray[np.float64], thresholds: Sequence[float], seed: int
+) -> dict[str, list[float]]:
+    """Bootstrap intervals of the AUC of errors (n,) by threshold."""
+    return {
+        f"{t:g}": rounded_interval(bootstrap_mean(auc_contributions(errors, t), seed=seed))
+        for t in thresholds
+    }
+
+
+def finite_or_none(value: float, digits: int | None = None) -> float | None:
+    """A number for JSON, which has no infinity: None for a failure."""
+    if not math.isfinite(value):
+        return None
+    return float(value) if digits is None else round(float(value), digits)
 
 
 def _processor() -> str:

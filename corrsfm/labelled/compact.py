@@ -36,15 +36,27 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import normalise_by_pinhole
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
-from corrsfm.labelled.oanet import OANetPair, open_pairs, pinhole_parameters, select_per_scene
+from corrsfm.labelled.oanet import OANetPair, open_pairs, select_per_scene
 from corrsfm.types import Camera
 
-__all__ = ["NO_NEIGHBOUR", "CompactScene", "is_compact", "read_labelled_pairs", "read_scenes", "write_scenes"]
+__all__ = [
+    "NO_NEIGHBOUR",
+    "RATIO_STEPS",
+    "CompactScene",
+    "is_compact",
+    "quantise_ratios",
+    "read_labelled_pairs",
+    "read_scenes",
+    "write_scenes",
+]
 
 NO_NEIGHBOUR = 65535
+RATIO_STEPS = 255.0
+"""A stored ratio of 1."""
 _FORMAT, _VERSION = "corrsfm-pairs", 1
 _NUM_PARAMS = 12
 
@@ -100,8 +112,7 @@ class CompactScene:
     def normalised(self, image: int, *, undistorted: bool) -> NDArray[np.float64]:
         """Normalised keypoints (N, 2) of one photo, by the pinhole part of its camera or the full model."""
         rows = slice(*self.keypoint_offsets[image : image + 2])
-        fx, fy, cx, cy = pinhole_parameters(self.cameras[image])
-        points = (self.keypoints[rows] - np.array([cx, cy])) / np.array([fx, fy])
+        points = normalise_by_pinhole(self.cameras[image], self.keypoints[rows])
         return points + self.corrections[rows] if undistorted else points
 
     def matched(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -153,6 +164,11 @@ class CompactScene:
         )
 
 
+def quantise_ratios(ratios: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Ratios as they are stored, in units of 1 / `RATIO_STEPS`."""
+    return np.round(np.clip(ratios, 0, 1) * RATIO_STEPS).astype(np.uint8)
+
+
 def _encode(scene: CompactScene) -> dict[str, NDArray]:
     """Datasets of a scene as they are stored."""
     sizes = np.array([(camera.width, camera.height) for camera in scene.cameras], np.int32).reshape(-1, 2)
@@ -175,7 +191,7 @@ def _encode(scene: CompactScene) -> dict[str, NDArray]:
         "covisible": scene.covisible.astype(np.int32),
         "match_offsets": scene.match_offsets,
         "neighbours": scene.neighbours,
-        "ratios": np.round(np.clip(scene.ratios, 0, 1) * 255.0).astype(np.uint8),
+        "ratios": quantise_ratios(scene.ratios),
         "mutual": np.packbits(scene.mutual),
     }
 
@@ -236,7 +252,7 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
         covisible=stored["covisible"].astype(np.int64),
         match_offsets=stored["match_offsets"],
         neighbours=stored["neighbours"],
-        ratios=(stored["ratios"] / 255.0).astype(np.float32),
+        ratios=(stored["ratios"] / RATIO_STEPS).astype(np.float32),
         mutual=np.unpackbits(stored["mutual"], count=num_matches).astype(bool),
     )
 

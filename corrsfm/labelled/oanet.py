@@ -25,14 +25,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
+from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.types import Camera, Correspondences
 
 __all__ = [
     "OANetPair",
     "open_pairs",
-    "pinhole_parameters",
     "read_pairs",
     "select_per_scene",
     "write_pairs",
@@ -50,8 +51,7 @@ class OANetPair:
     correspondences : (N, 4) float32
         ``x0 y0 x1 y1``, normalised by the cameras below.
     label_distances : (N,) float32
-        Squared symmetric epipolar distance to the true geometry, normalised units. Right matches are those
-        below 1e-4.
+        Squared symmetric epipolar distance to the true geometry, normalised units; see `inliers`.
     rotation : (3, 3) float64
         Of ``cam1_from_cam0``.
     translation : (3,) float64
@@ -105,8 +105,8 @@ class OANetPair:
     def __len__(self) -> int:
         return len(self.correspondences)
 
-    def inliers(self, threshold: float = 1e-4) -> NDArray[np.bool_]:
-        """True where a match is right: squared symmetric epipolar distance below the threshold."""
+    def inliers(self, threshold: float = INLIER_THRESHOLD) -> NDArray[np.bool_]:
+        """Matches (N,) whose label distance is below the threshold."""
         return self.label_distances < threshold
 
     def as_correspondences(self) -> Correspondences:
@@ -127,14 +127,6 @@ class OANetPair:
             camera1=self.camera1,
             name=self.name,
         )
-
-
-def pinhole_parameters(camera: Camera) -> tuple[float, float, float, float]:
-    """Focal lengths and principal point ``fx fy cx cy`` in pixels: a camera without its distortion."""
-    params = camera.params
-    if camera.model.startswith(("SIMPLE_", "RADIAL")):
-        return params[0], params[0], params[1], params[2]
-    return params[0], params[1], params[2], params[3]
 
 
 def _to_pixels(camera: Camera, normalised: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -649,7 +649,7 @@ class PruningBlock(nn.Module):
     """Stem, motion embedding and fusion rounds on one set of correspondences."""
 
     def __init__(
-        self, *, input_channels: int, fusion_rounds: int, channels: int, motion: bool, **fusion
+        self, *, input_channels: int, fusion_rounds: int, channels: int, motion: bool, **fusion: Any
     ) -> None:
         super().__init__()
         self.stem = nn.Linear(input_channels, channels)
@@ -718,6 +718,14 @@ class PruningOutput(NamedTuple):
     """(B,3,3), unit norm, x1^T E x0 = 0; the fundamental matrix with ``estimate="fundamental"``."""
     residuals: Tensor
     """(B,N), squared symmetric epipolar distance of every input to `essential`."""
+
+    def last_logits(self) -> Tensor:
+        """Last logit of each input, (B,N) float32: later sets judge fewer. Minus infinity on padding."""
+        last = torch.full(self.residuals.shape, -math.inf, device=self.residuals.device)
+        for values, indices in zip(self.logits, self.indices, strict=True):
+            # Padding says minus infinity, and its index may be that of an input: it must not overwrite.
+            last.scatter_(1, indices, torch.where(values.isneginf(), last.gather(1, indices), values.float()))
+        return last
 
 
 @dataclass(frozen=True, kw_only=True)

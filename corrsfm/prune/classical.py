@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.prune import robust
+from corrsfm.prune.correspondences import distinctiveness
 from corrsfm.types import Correspondences, PruneResult
 
 __all__ = ["EstimatorPruner", "KeepAll", "RatioPruner", "select_ratio"]
@@ -27,11 +28,6 @@ def select_ratio(pair: Correspondences, max_ratio: float) -> NDArray[np.bool_]:
     (M,) bool
     """
     return pair.mutual & (pair.ratios <= max_ratio)
-
-
-def _distinctiveness(pair: Correspondences) -> NDArray[np.float32]:
-    """One minus the descriptor distance ratio, in [0, 1]; 0 where the ratio is not a number."""
-    return np.clip(1.0 - np.nan_to_num(pair.ratios, nan=1.0), 0.0, 1.0).astype(np.float32)
 
 
 def _result_from_estimate(
@@ -84,7 +80,9 @@ class KeepAll:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`."""
         return [
             PruneResult(
-                scores=_distinctiveness(pair), inlier_mask=np.ones(len(pair), bool), decided_by=self.name
+                scores=distinctiveness(pair.ratios),
+                inlier_mask=np.ones(len(pair), bool),
+                decided_by=self.name,
             )
             for pair in pairs
         ]
@@ -110,7 +108,7 @@ class RatioPruner:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`."""
         return [
             PruneResult(
-                scores=_distinctiveness(pair) * pair.mutual,
+                scores=distinctiveness(pair.ratios) * pair.mutual,
                 inlier_mask=select_ratio(pair, self._max_ratio),
                 decided_by=self.name,
             )

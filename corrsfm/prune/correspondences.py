@@ -1,9 +1,13 @@
 """Putative matches as prune methods see them: points, normalised points and side information.
 
-A part of the prune stage that training shares, so that a network is trained on the very numbers it will see.
+Training shares this part of the prune stage, so that a network learns from the very numbers it will see.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,16 +17,18 @@ from corrsfm.errors import InputError
 from corrsfm.geometry import wrap_angles
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
-__all__ = ["SIDE_CHANNELS", "correspondences_from_points", "make_correspondences", "side_information"]
-
-SIDE_CHANNELS = {0: (), 2: ("ratio", "mutual"), 5: ("ratio", "mutual", "log_scale_ratio", "cos", "sin")}
-"""Names of the side channels by their number, the layouts that networks may be made for."""
+__all__ = [
+    "SIDE_CHANNELS",
+    "SIDE_LAYOUTS",
+    "correspondences_from_points",
+    "distinctiveness",
+    "make_correspondences",
+    "side_channels",
+    "side_information",
+]
 
 UNKNOWN_RATIO = 0.8
 """Descriptor distance ratio that stands in for one that is not known."""
-
-# Scales differ by e³ ≈ 20 between two photos at most; beyond is a broken keypoint.
-_MAX_LOG_SCALE_RATIO = 3.0
 
 
 def make_correspondences(
@@ -139,16 +145,92 @@ def _pinhole(matrix: ArrayLike, points: NDArray[np.float32]) -> Camera:
     return Camera.from_matrix(matrix, int(width), int(height))
 
 
+def distinctiveness(ratios: NDArray[np.floating]) -> NDArray[np.float32]:
+    """One minus the ratio of the two nearest descriptor distances, in [0, 1]; 0 where the ratio is NaN."""
+    return np.clip(1.0 - np.nan_to_num(ratios, nan=1.0), 0.0, 1.0).astype(np.float32)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SideChannel:
+    """One column of side information.
+
+    Attributes
+    ----------
+    source : str
+        Attribute of the matches that holds the values.
+    function : {"", "cos", "sin"}
+        Applied to the values, unless empty.
+    bounds : tuple of float or None
+        Values are clipped to them.
+    unknown : float
+        Replaces NaN, which says nothing about the match, and without bounds infinity.
+    """
+
+    source: str
+    function: str = ""
+    bounds: tuple[float, float] | None = None
+    unknown: float = 0.0
+
+    def compute(self, matches: Any, library: ModuleType) -> Any:
+        """The column, from matches whose attributes are arrays of a library, numpy or torch."""
+        low, high = self.bounds or (self.unknown, self.unknown)
+        values = library.nan_to_num(getattr(matches, self.source), nan=self.unknown, posinf=high, neginf=low)
+        if self.bounds:
+            values = library.clip(values, low, high)
+        return getattr(library, self.function)(values) if self.function else values
+
+
+SIDE_CHANNELS = {
+    "ratio": SideChannel(source="ratios", bounds=(0.0, 1.0), unknown=1.0),
+    "mutual": SideChannel(source="mutual"),
+    # The natural logarithm. Scales differ by e³ ≈ 20 between two photos at most; beyond is a broken keypoint.
+    "log_scale_ratio": SideChannel(source="log_scale_ratios", bounds=(-3.0, 3.0)),
+    "cos": SideChannel(source="rotations", function="cos"),
+    "sin": SideChannel(source="rotations", function="sin"),
+}
+"""The side channels of a network's input by name, in order."""
+
+SIDE_LAYOUTS = (0, 2, 5)
+"""How many of them, counted from the first, a network may be made for."""
+
+
+def side_channels(matches: Any, num_channels: int, library: ModuleType) -> Any:
+    """The first side channels, always finite.
+
+    Parameters
+    ----------
+    matches : object
+        With ``ratios``, ``mutual``, ``log_scale_ratios`` and ``rotations``, arrays of one shape: a
+        `Correspondences`, or a batch of training.
+    num_channels : int
+        One of `SIDE_LAYOUTS` other than 0.
+    library : module
+        That the arrays are of: numpy, or torch.
+
+    Returns
+    -------
+    (..., num_channels) array or tensor
+
+    Raises
+    ------
+    ValueError
+        If there is no layout of that many channels.
+    """
+    if num_channels not in SIDE_LAYOUTS[1:]:
+        raise ValueError(f"no layout of {num_channels} side channels, there are {list(SIDE_LAYOUTS)}")
+    channels = list(SIDE_CHANNELS.values())[:num_channels]
+    return library.stack([channel.compute(matches, library) for channel in channels], -1)
+
+
 def side_information(correspondences: Correspondences, num_channels: int) -> NDArray[np.float32]:
-    """Side channels of a network's input, always finite.
+    """Side channels of a network's input, as numpy array.
 
     Parameters
     ----------
     correspondences : Correspondences
         M putative matches.
-    num_channels : {0, 2, 5}
-        0: none; 2: ratio in [0, 1] and mutual as 0 or 1; 5: these and the natural logarithm of the scale
-        ratio (clipped to ±3), cosine and sine of the rotation between the keypoints.
+    num_channels : int
+        One of `SIDE_LAYOUTS`.
 
     Returns
     -------
@@ -159,17 +241,6 @@ def side_information(correspondences: Correspondences, num_channels: int) -> NDA
     ValueError
         If there is no layout of that many channels.
     """
-    if num_channels not in SIDE_CHANNELS:
-        raise ValueError(f"no layout of {num_channels} side channels, there are {sorted(SIDE_CHANNELS)}")
-    # What is not finite says nothing about the match: the worst ratio, no change of scale or angle.
-    ratios = np.clip(np.nan_to_num(correspondences.ratios, nan=1.0, posinf=1.0), 0.0, 1.0)
-    log_scale_ratios = np.nan_to_num(correspondences.log_scale_ratios, nan=0.0)
-    rotations = np.nan_to_num(correspondences.rotations, nan=0.0, posinf=0.0, neginf=0.0)
-    channels = [
-        ratios,
-        correspondences.mutual,
-        np.clip(log_scale_ratios, -_MAX_LOG_SCALE_RATIO, _MAX_LOG_SCALE_RATIO),
-        np.cos(rotations),
-        np.sin(rotations),
-    ]
-    return np.ascontiguousarray(np.stack(channels, axis=1)[:, :num_channels], np.float32)
+    if num_channels == 0:
+        return np.zeros((len(correspondences), 0), np.float32)
+    return np.ascontiguousarray(side_channels(correspondences, num_channels, np), np.float32)

@@ -273,11 +273,7 @@ class Pruner:
                 torch.from_numpy(side).to(self.device) if self._side_channels else None,
                 None if mask.all() else torch.from_numpy(mask).to(self.device),
             )
-            logits = torch.full(coordinates.shape[:2], -torch.inf, device=self.device)
-            for values, indices in zip(output.logits, output.indices, strict=True):
-                # Later sets judge fewer matches; padding says minus infinity and must not overwrite.
-                earlier = logits.gather(1, indices)
-                logits.scatter_(1, indices, torch.where(values.isneginf(), earlier, values.float()))
+            logits = output.last_logits()
         all_logits = logits.cpu().numpy()
         essentials = output.essential.double().cpu().numpy()
         estimates = []

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import to_pycolmap
+from corrsfm.colmap.cameras import mean_focal_px, to_pycolmap
 from corrsfm.colmap.log import colmap_log
 from corrsfm.geometry import symmetric_epipolar_distance_sq
 from corrsfm.types import Camera, Correspondences, TwoViewModel
@@ -200,7 +200,7 @@ def _magsac_pair(
     try:
         if calibrated:
             points = pair.normalised[rows].astype(np.float64)
-            params.threshold /= _mean_focal_length_px(pair)
+            params.threshold /= mean_focal_px(pair.camera0, pair.camera1)
             eye = np.eye(3)
             matrix, _ = cv2.findEssentialMat(points[:, :2], points[:, 2:], eye, eye, None, None, params)
         else:
@@ -227,11 +227,6 @@ def _calibration_matrix(camera: Camera) -> NDArray[np.float64]:
     return np.asarray(to_pycolmap(camera).calibration_matrix(), np.float64)
 
 
-def _mean_focal_length_px(pair: Correspondences) -> float:
-    focal_lengths = [to_pycolmap(camera).mean_focal_length() for camera in (pair.camera0, pair.camera1)]
-    return float(np.mean(focal_lengths))
-
-
 def _residual_of_nothing(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Set distances of non-finite coordinates to infinity."""
     return np.where(np.isfinite(values), values, np.inf)
@@ -253,7 +248,7 @@ def sampson_errors_px(model: TwoViewModel, pair: Correspondences) -> NDArray[np.
         in normalised coordinates, scaled by the mean focal length.
     """
     if model.kind == "essential":
-        points, scale = pair.normalised.astype(np.float64), _mean_focal_length_px(pair)
+        points, scale = pair.normalised.astype(np.float64), mean_focal_px(pair.camera0, pair.camera1)
     else:
         points, scale = np.hstack([pair.points0, pair.points1]).astype(np.float64), 1.0
     ones = np.ones((len(points), 1))

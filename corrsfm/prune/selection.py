@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.config import OperatingPoint
+from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.types import Correspondences
 
 __all__ = ["score_matches", "select_candidates", "select_kept"]
@@ -15,9 +16,6 @@ POSE_MIN_SCORE = 0.5
 SFM_MIN_SCORE = 0.3
 CONFIDENT_SCORE = 0.7
 MIN_NUM_CONFIDENT = 20
-
-# Squared symmetric epipolar distance, normalised units, up to which a matrix explains a match.
-MAX_RESIDUAL = 1e-4
 
 
 def select_candidates(pair: Correspondences, max_candidates: int) -> NDArray[np.intp]:
@@ -54,15 +52,15 @@ def score_matches(logits: NDArray[np.float32], residuals: NDArray[np.float32]) -
     Returns
     -------
     (M,) float32
-        The logistic function of the logit. For an unseen match ``a · exp(−residual / 1e-4)``, where a is
-        the share of the probable matches that the matrix explains.
+        The logistic function of the logit. For an unseen match ``a · exp(−residual / INLIER_THRESHOLD)``,
+        where a is the share of the probable matches that the matrix explains.
     """
     unseen = np.isneginf(logits)
     with np.errstate(over="ignore"):  # exp(∞) has the right limit
         scores = 1.0 / (1.0 + np.exp(-logits))
     probable = scores > POSE_MIN_SCORE
-    agreement = float(np.mean(residuals[probable] < MAX_RESIDUAL)) if probable.any() else 0.0
-    return np.where(unseen, agreement * np.exp(-residuals / MAX_RESIDUAL), scores).astype(np.float32)
+    agreement = float(np.mean(residuals[probable] < INLIER_THRESHOLD)) if probable.any() else 0.0
+    return np.where(unseen, agreement * np.exp(-residuals / INLIER_THRESHOLD), scores).astype(np.float32)
 
 
 def select_kept(

@@ -10,6 +10,8 @@ from typing import Any
 from corrsfm.config import from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
+from corrsfm.geometry import INLIER_THRESHOLD
+from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
 
 __all__ = [
     "AugmentConfig",
@@ -59,7 +61,9 @@ class AugmentConfig:
         0.01, "Standard deviation of a principal point in focal lengths", minimum=0
     )
     unknown_focal_probability: float = option(
-        0.15, "Use 1.2 times the longest side as the focal length, as where nothing is known", minimum=0
+        0.15,
+        f"Use {DEFAULT_FOCAL_FACTOR} times the longest side as the focal length, as where nothing is known",
+        minimum=0,
     )
     thin_probability: float = option(0.3, "Drop up to 85 % of the right matches", minimum=0)
 
@@ -92,7 +96,9 @@ class TrainConfig:
     weight_decay: float = option(1e-4, "Decoupled weight decay of AdamW", minimum=0)
     max_gradient_norm: float = option(1.0, "Gradients are scaled down to this length", minimum=0)
     ema_decay: float = option(0.999, "Decay of the moving average of the weights; 0 for none", minimum=0)
-    threshold: float = option(1e-4, "Largest squared symmetric epipolar distance of a right match", minimum=0)
+    threshold: float = option(
+        INLIER_THRESHOLD, "Largest squared symmetric epipolar distance of a right match", minimum=0
+    )
     essential_start: float = option(0.05, "Share of the run without the essential loss", minimum=0)
     essential_weight: float = option(0.5, "Weight of the essential loss", minimum=0)
     bfloat16: bool = option(False, "Compute in bfloat16 where that is safe")

@@ -15,14 +15,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
-from corrsfm.geometry import essential_from_pose, relative_pose
-from corrsfm.labelled.compact import CompactScene, is_compact, read_scenes
-from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs
+from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
+from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
+from corrsfm.labelled.compact import RATIO_STEPS, CompactScene, is_compact, quantise_ratios, read_scenes
+from corrsfm.labelled.oanet import OANetPair, read_pairs
+from corrsfm.model.network import symmetric_epipolar_squared
+from corrsfm.prune.correspondences import side_channels
 from corrsfm.training.config import AugmentConfig
-from corrsfm.training.losses import THRESHOLD, epipolar_distance_sq
 
-__all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_channels"]
+__all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_information"]
 
 # A pair with fewer right matches has no label worth learning from.
 _MIN_INLIERS = 20
@@ -57,7 +60,11 @@ class Batch:
 
     def distances(self) -> Tensor:
         """Squared symmetric epipolar distances (B, N) to the truth."""
-        return epipolar_distance_sq(self.matrix, self.true_correspondences)
+        return symmetric_epipolar_squared(self.true_correspondences, self.matrix)
+
+    def inliers(self) -> Tensor:
+        """Matches (B, N) that agree with the truth; False for padding."""
+        return (self.distances() < INLIER_THRESHOLD) & self.mask
 
     def __len__(self) -> int:
         return len(self.matrix)
@@ -71,18 +78,9 @@ def concatenate(batches: Sequence[Batch]) -> Batch:
     return Batch(**columns)
 
 
-def side_channels(batch: Batch, num_channels: int) -> Tensor | None:
-    """Side information (B, N, S) as `corrsfm.prune.side_information` lays it out, or None for no channels."""
-    if num_channels == 0:
-        return None
-    channels = [
-        batch.ratios,
-        batch.mutual,
-        batch.log_scale_ratios.clamp(-3.0, 3.0),
-        batch.rotations.cos(),
-        batch.rotations.sin(),
-    ]
-    return torch.stack(channels[:num_channels], dim=-1)
+def side_information(batch: Batch, num_channels: int) -> Tensor | None:
+    """Side information (B, N, S) as `corrsfm.prune.correspondences` lays it out; None for no channels."""
+    return side_channels(batch, num_channels, torch) if num_channels else None
 
 
 _BATCH_FIELDS = tuple(entry.name for entry in fields(Batch))
@@ -154,7 +152,7 @@ class RealPairs:
             pairs = torch.arange(start, min(start + 64, self.num_pairs), device=self.device)
             width = int(self._arrays["num_matches"][pairs].max())
             batch = self._gather(pairs, torch.arange(width, device=self.device).expand(len(pairs), -1))
-            right = (batch.distances() < THRESHOLD) & batch.mask
+            right = batch.inliers()
             counts.append(right.sum(1))
             ratios.append(right.sum(1) / batch.mask.sum(1).clamp(min=1))
         return torch.cat(ratios), torch.cat(counts)
@@ -187,7 +185,7 @@ class RealPairs:
             correspondences=pinhole,
             true_correspondences=pinhole + torch.cat([a["corrections"][key0], a["corrections"][key1]], -1),
             matrix=a["matrix"][pairs],
-            ratios=a["ratios"][rows].float() / 255.0,
+            ratios=a["ratios"][rows].float() / RATIO_STEPS,
             mutual=a["mutual"][rows].float(),
             log_scale_ratios=(a["log_scales"][key1] - a["log_scales"][key0]).float(),
             rotations=a["orientations"][key1] - a["orientations"][key0],
@@ -207,7 +205,7 @@ class RealPairs:
         columns = torch.arange(width, device=self.device)
         if config.thin_probability > 0:
             batch = self._gather(pairs, columns.expand(num_pairs, -1))
-            right = batch.distances() < THRESHOLD
+            right = batch.inliers()
             draw = torch.rand(num_pairs, 2, 1, device=self.device, generator=generator)
             keep = torch.where(draw[:, 0] < config.thin_probability, 0.15 + 0.85 * draw[:, 1], 1.0)
             thinned = right & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)
@@ -232,7 +230,7 @@ def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str
         "orientations": np.concatenate([zeros, pair.rotations]),
         "key0": rows.astype(dtype),
         "key1": (rows + num).astype(dtype),
-        "ratios": np.round(np.clip(pair.ratios, 0, 1) * 255.0).astype(np.uint8),
+        "ratios": quantise_ratios(pair.ratios),
         "mutual": pair.mutual,
         "num_matches": np.array([num]),
         "match_start": np.array([first_match]),
@@ -275,7 +273,7 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
         "orientations": scene.orientations,
         "key0": key[0],
         "key1": key[1],
-        "ratios": np.round(scene.ratios[rows] * 255.0).astype(np.uint8),
+        "ratios": quantise_ratios(scene.ratios[rows]),
         "mutual": scene.mutual[rows],
         "num_matches": counts,
         "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
@@ -285,9 +283,9 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
 
 
 def _guess_factor(scene: CompactScene, image: int) -> float:
-    """True focal length over the one that is assumed when nothing is known, 1.2 times the longest side."""
+    """True focal length over the one that is assumed where nothing is known."""
     camera = scene.cameras[image]
-    return pinhole_parameters(camera)[0] / (1.2 * max(camera.width, camera.height))
+    return pinhole_parameters(camera)[0] / (DEFAULT_FOCAL_FACTOR * max(camera.width, camera.height))
 
 
 def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch.Generator) -> Batch:

@@ -29,9 +29,10 @@ from corrsfm import __version__
 from corrsfm.config import from_dict, to_dict
 from corrsfm.errors import ConfigError, DependencyError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
+from corrsfm.prune.correspondences import SIDE_LAYOUTS
 from corrsfm.training.checkpoint import Average, load_state, save_state
 from corrsfm.training.config import Schedule, TrainRecipe
-from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_channels
+from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
 from corrsfm.training.losses import classification_loss, essential_loss, virtual_points
 from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
@@ -103,8 +104,19 @@ def train(
 
 
 def network_config(recipe: TrainRecipe) -> NetworkConfig:
-    """The architecture that a recipe asks for."""
-    return from_dict(NetworkConfig, recipe.network, "network")
+    """The architecture that a recipe asks for.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be built, or pruning could not feed it.
+    """
+    config = from_dict(NetworkConfig, recipe.network, "network")
+    if config.side_channels not in SIDE_LAYOUTS:
+        raise ConfigError(
+            f"network: side_channels is {config.side_channels}, expected one of {list(SIDE_LAYOUTS)}"
+        )
+    return config
 
 
 def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
@@ -276,7 +288,7 @@ class Trainer:
         mask = None if bool(batch.mask.all()) else batch.mask
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
             output = self._model(
-                batch.correspondences, side_channels(batch, self.network.side_channels), mask
+                batch.correspondences, side_information(batch, self.network.side_channels), mask
             )
         distances = batch.distances()
         steps = [distances.gather(1, indices) for indices in output.indices]

@@ -8,10 +8,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-__all__ = ["classification_loss", "epipolar_distance_sq", "essential_loss", "virtual_points"]
+from corrsfm.geometry import INLIER_THRESHOLD
+from corrsfm.model.network import symmetric_epipolar_squared
 
-THRESHOLD = 1e-4
-"""τ: largest squared symmetric epipolar distance of a right match."""
+__all__ = ["classification_loss", "essential_loss", "virtual_points"]
+
 MARGIN = 0.1
 """Distances of virtual points count up to here."""
 
@@ -20,7 +21,7 @@ def classification_loss(
     logits: Sequence[Tensor],
     distances: Sequence[Tensor],
     mask: Sequence[Tensor] | None = None,
-    threshold: float = THRESHOLD,
+    threshold: float = INLIER_THRESHOLD,
 ) -> Tensor:
     """Binary cross entropy with adaptive temperature, summed over the pruning steps.
 
@@ -33,7 +34,7 @@ def classification_loss(
     mask : sequence of (B, N_s) bool tensors, optional
         False for padding, which counts nowhere.
     threshold : float
-        τ of the paper.
+        τ of the paper: largest distance of an inlier.
 
     Returns
     -------
@@ -67,20 +68,7 @@ def essential_loss(essential: Tensor, points: Tensor) -> Tensor:
     points : (B, V, 4) tensor
         True correspondences, see `virtual_points`.
     """
-    return epipolar_distance_sq(essential, points).clamp(max=MARGIN).mean()
-
-
-def epipolar_distance_sq(matrix: Tensor, points: Tensor) -> Tensor:
-    """Squared symmetric epipolar distance (B, N) of correspondences (B, N, 4) to matrices (B, 3, 3)."""
-    x0 = F.pad(points[..., :2], (0, 1), value=1.0)
-    x1 = F.pad(points[..., 2:], (0, 1), value=1.0)
-    line1 = x0 @ matrix.transpose(1, 2)
-    line0 = x1 @ matrix
-    numerator = (x1 * line1).sum(-1).square()
-    floor = 1e-15
-    return numerator * (
-        1 / (line1[..., :2].square().sum(-1) + floor) + 1 / (line0[..., :2].square().sum(-1) + floor)
-    )
+    return symmetric_epipolar_squared(points, essential).clamp(max=MARGIN).mean()
 
 
 def virtual_points(matrix: Tensor, *, num_iterations: int = 10) -> Tensor:

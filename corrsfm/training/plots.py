@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import DependencyError, InputError
 from corrsfm.training.dataset import Batch
-from corrsfm.training.losses import THRESHOLD
 
 __all__ = ["plot_distributions", "plot_learning_curves"]
 
@@ -79,8 +78,7 @@ def _measures(batches: Sequence[Batch]) -> dict[str, NDArray[np.float64]]:
     """What real and synthetic pairs are compared by."""
     found: dict[str, list[NDArray]] = {}
     for batch in batches:
-        distances = batch.distances()
-        right = (distances < THRESHOLD) & batch.mask
+        distances, right = batch.distances(), batch.inliers()
         wrong = ~right & batch.mask
         motion = (batch.correspondences[..., 2:] - batch.correspondences[..., :2]).norm(dim=-1)
         share = right.sum(1) / batch.mask.sum(1)

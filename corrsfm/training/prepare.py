@@ -1,9 +1,9 @@
 """Photo scenes with cameras → labelled pairs.
 
-A scene is a folder with ``images/`` and a COLMAP model (text or binary) beside it or in ``sparse/0`` or
-``model``, or the workspace of a reconstruction, which remembers where its photos are. The pairs come from
-``covisibility.txt`` (``name0 name1 count``) if there is one, else from the model's points. What the
-features and matches are is decided by the same stages that inference runs.
+A scene is a folder with ``images/`` and a COLMAP model (`corrsfm.colmap.models.find_model` says where), or
+the workspace of a reconstruction, which remembers where its photos are. The pairs come from
+``covisibility.txt`` (``name0 name1 count``) if there is one, else from the model's points. Features and
+matches are those of the stages that inference runs.
 """
 
 from __future__ import annotations
@@ -14,21 +14,25 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
+from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_by_pinhole, normalise_points
+from corrsfm.colmap.models import find_model, poses_of, read_model
 from corrsfm.errors import ImageError, InputError, WorkspaceError
 from corrsfm.features.sift import extract_features
 from corrsfm.images.photos import read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
-from corrsfm.labelled.oanet import pinhole_parameters, write_pairs
+from corrsfm.labelled.oanet import write_pairs
 from corrsfm.matches.nearest import match_features
 from corrsfm.training.config import PrepareConfig
 from corrsfm.types import Camera, Features
 from corrsfm.workspace import Workspace
+
+if TYPE_CHECKING:
+    import pycolmap
 
 __all__ = [
     "choose_pairs",
@@ -228,36 +232,28 @@ def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
 
 def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:
     """Undistorted minus pinhole normalised coordinates (N, 2)."""
-    fx, fy, cx, cy = pinhole_parameters(camera)
-    pixels = keypoints.astype(np.float64)
-    undistorted = normalise_points(camera, pixels)
     # A model of strong distortion may have no ray for a corner of the photo; such a point keeps its pinhole
     # ray, its label is then "far from the line", which is what inference would find too.
-    pinhole = (pixels - [cx, cy]) / [fx, fy]
-    return np.nan_to_num(undistorted - pinhole, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
+    corrections = normalise_points(camera, keypoints) - normalise_by_pinhole(camera, keypoints)
+    return np.nan_to_num(corrections, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
 
 
 def _read_model(folder: Path) -> _SceneModel:
-    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "model"):
-        if any((place / f"cameras{suffix}").exists() for suffix in (".txt", ".bin")):
-            reconstruction = pycolmap.Reconstruction(place)
-            break
-    else:
-        raise InputError(
-            f"{folder}: holds no COLMAP model (cameras.txt or cameras.bin), nor does its sparse/0 or model"
-        )
-    images = sorted(reconstruction.images.values(), key=lambda image: image.name)
-    names = tuple(image.name for image in images)
-    poses = [image.cam_from_world() for image in images]
+    reconstruction = read_model(find_model(folder))
+    poses = poses_of(reconstruction)
+    names = tuple(poses)
+    images = {image.name: image for image in reconstruction.images.values()}
     cameras = tuple(
-        replace(camera_from_pycolmap(reconstruction.cameras[image.camera_id]), has_prior_focal_length=True)
-        for image in images
+        replace(
+            camera_from_pycolmap(reconstruction.cameras[images[name].camera_id]), has_prior_focal_length=True
+        )
+        for name in names
     )
     return _SceneModel(
         names=names,
         cameras=cameras,
-        rotations=np.array([pose.rotation.matrix() for pose in poses]).reshape(-1, 3, 3),
-        translations=np.array([pose.translation for pose in poses]).reshape(-1, 3),
+        rotations=np.array([rotation for rotation, _ in poses.values()]).reshape(-1, 3, 3),
+        translations=np.array([translation for _, translation in poses.values()]).reshape(-1, 3),
         covisible=_covisible(folder / "covisibility.txt", names, reconstruction),
     )
 

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from corrsfm.training.dataset import Batch
-from corrsfm.training.losses import THRESHOLD
 
 __all__ = ["LEVELS", "MEASURED", "SideStatistics", "measure"]
 
@@ -104,7 +103,7 @@ def measure(batches: Iterable[Batch]) -> SideStatistics:
     """
     columns: dict[str, list[Tensor]] = {}
     for batch in batches:
-        right = (batch.distances() < THRESHOLD) & batch.mask
+        right = batch.inliers()
         share = right.sum(1, keepdim=True) / batch.mask.sum(1, keepdim=True).clamp(min=1)
         rotation = torch.remainder(batch.rotations + torch.pi, 2 * torch.pi) - torch.pi
         typical_scale = (

@@ -10,17 +10,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.errors import DependencyError
 from corrsfm.evaluation.metrics import pose_auc, precision_recall_f
-from corrsfm.geometry import pose_error_deg
+from corrsfm.evaluation.two_view.estimators import parse_estimator, pose_errors_deg
+from corrsfm.evaluation.two_view.filters import parse_filter
 from corrsfm.labelled.compact import read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.model import CorrAdaptor
 from corrsfm.prune.correspondences import side_information
+from corrsfm.prune.selection import POSE_MIN_SCORE
+from corrsfm.types import PruneResult
 
-__all__ = ["Validation", "match_scores", "pose_error_after_loransac"]
+__all__ = ["Validation", "match_scores", "pose_error_deg"]
 
-_MIN_MATCHES = 5
+BASELINE = "ratio0.8+mutual"
+"""The classical filter that networks are compared with."""
+
+_ESTIMATE = parse_estimator("poselib")
+_SEED = 0
 
 
 def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) -> NDArray[np.float32]:
@@ -31,44 +37,25 @@ def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) ->
             torch.from_numpy(pair.correspondences)[None].to(device),
             torch.from_numpy(side)[None].to(device) if network.side_channels else None,
         )
-        logits = torch.full((1, len(pair)), -torch.inf, device=device)
-        for values, indices in zip(output.logits, output.indices, strict=True):
-            logits.scatter_(1, indices, values.float())
-    return logits[0].sigmoid().cpu().numpy()
+    return output.last_logits()[0].sigmoid().cpu().numpy()
 
 
-def pose_error_after_loransac(pair: OANetPair, kept: NDArray, max_error_px: float = 1.0) -> float:
-    """Larger of rotation and translation error in degrees of PoseLib's LO-RANSAC on the kept matches.
+def pose_error_deg(pair: OANetPair, kept: NDArray[np.bool_]) -> float:
+    """Larger of rotation and translation error in degrees, by the estimator of `corrsfm evaluate pose`.
 
     Parameters
     ----------
     pair : OANetPair
-    kept : (K,) int or (M,) bool
+    kept : (M,) bool
         Matches that are handed to the estimator.
-    max_error_px : float
 
     Returns
     -------
     float
         Infinite if there is no pose.
     """
-    try:
-        import poselib
-    except ImportError as error:
-        raise DependencyError("poselib", "validation behind LO-RANSAC", "evaluate") from error
-    matches = pair.as_correspondences()
-    points0, points1 = matches.points0[kept], matches.points1[kept]
-    if len(points0) < _MIN_MATCHES:
-        return float("inf")
-    cameras = [
-        {"model": camera.model, "width": camera.width, "height": camera.height, "params": list(camera.params)}
-        for camera in (pair.camera0, pair.camera1)
-    ]
-    pose, _ = poselib.estimate_relative_pose(
-        points0.astype(np.float64), points1.astype(np.float64), *cameras, {"max_epipolar_error": max_error_px}
-    )
-    largest = max(pose_error_deg(pose.R, pose.t, pair.rotation, pair.translation))
-    return largest if np.isfinite(largest) else float("inf")
+    result = PruneResult(scores=kept.astype(np.float32), inlier_mask=kept)
+    return max(pose_errors_deg(_ESTIMATE(pair.as_correspondences(), result, _SEED), pair))
 
 
 class Validation:
@@ -84,11 +71,12 @@ class Validation:
 
     def __init__(self, path: Path, pairs_per_scene: int, seed: int = 0) -> None:
         self.pairs = list(read_labelled_pairs(path, num_per_scene=pairs_per_scene, seed=seed))
-        self.baseline = self._summary(
-            [pose_error_after_loransac(pair, pair.mutual & (pair.ratios < 0.8)) for pair in self.pairs]
-        )
+        kept = [result.inlier_mask for result in parse_filter(BASELINE)(self.pairs)]
+        self.baseline = self._summary(list(map(pose_error_deg, self.pairs, kept)))
 
-    def run(self, network: CorrAdaptor, device: torch.device, threshold: float = 0.5) -> dict[str, Any]:
+    def run(
+        self, network: CorrAdaptor, device: torch.device, threshold: float = POSE_MIN_SCORE
+    ) -> dict[str, Any]:
         """Scores of a network: pose AUC over all pairs and by scene, precision, recall."""
         network.eval()
         scores = [match_scores(network, pair, device) for pair in self.pairs]
@@ -101,7 +89,7 @@ class Validation:
         errors, quality = [], []
         for pair, score in zip(self.pairs, scores, strict=True):
             kept = keep(score)
-            errors.append(pose_error_after_loransac(pair, kept))
+            errors.append(pose_error_deg(pair, kept))
             quality.append(precision_recall_f(kept, pair.inliers()))
         result = self._summary(errors)
         result["precision"], result["recall"], result["f"] = (float(v) for v in np.nanmean(quality, axis=0))

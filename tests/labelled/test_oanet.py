@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from two_view_pairs import make_pair
 
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, symmetric_epipolar_distance_sq
-from corrsfm.labelled.oanet import OANetPair, pinhole_parameters, read_pairs, select_per_scene, write_pairs
+from corrsfm.labelled.oanet import OANetPair, read_pairs, select_per_scene, write_pairs
 from corrsfm.types import Camera
 
 ARRAYS = (

@@ -433,6 +433,17 @@ def test_gradient_of_smallest_eigenvector_is_exact_where_it_is_defined_and_finit
     assert torch.equal(equal.grad, torch.zeros(4, 4, dtype=torch.float64))
 
 
+def test_the_last_logit_of_an_input_is_that_of_the_last_set_that_judged_it():
+    padding = -torch.inf
+    output = PruningOutput(
+        logits=(torch.tensor([[1.0, 2.0, 3.0, padding]]), torch.tensor([[4.0, padding]])),
+        indices=(torch.tensor([[0, 1, 2, 3]]), torch.tensor([[2, 1]])),
+        essential=torch.eye(3)[None],
+        residuals=torch.zeros(1, 4),
+    )
+    assert output.last_logits().tolist() == [[1.0, 2.0, 4.0, padding]]
+
+
 def test_bfloat16_ranks_like_float32():
     network = small_network(channels=32)
     pairs = two_view_pairs(2, 200)

@@ -7,9 +7,9 @@ import pytest
 import torch
 from labelled_scene import make_scene
 
-from corrsfm.prune.correspondences import side_information
+from corrsfm.prune import correspondences
 from corrsfm.training.config import AugmentConfig
-from corrsfm.training.dataset import RealPairs, augment, generator_for, side_channels
+from corrsfm.training.dataset import RealPairs, augment, generator_for, side_information
 
 CPU = torch.device("cpu")
 NOTHING = AugmentConfig(**{f.name: 0.0 for f in dataclasses.fields(AugmentConfig) if "probability" in f.name})
@@ -96,11 +96,11 @@ def test_side_channels_are_those_of_inference():
     scene = make_scene("a")
     data = RealPairs([scene], CPU)
     batch = data._gather(torch.tensor([0]), torch.arange(59)[None])
-    expected = side_information(scene.pair(0).as_correspondences(), 5)
-    channels = side_channels(batch, 5)
+    expected = correspondences.side_information(scene.pair(0).as_correspondences(), 5)
+    channels = side_information(batch, 5)
     assert channels is not None
     np.testing.assert_allclose(channels[0].numpy(), expected, atol=3e-3)
-    assert side_channels(batch, 0) is None
+    assert side_information(batch, 0) is None
 
 
 def test_batches_depend_on_seed_step_and_rank_only(data):

@@ -13,7 +13,7 @@ from corrsfm.model import load_network, read_provenance, save_network
 from corrsfm.training.checkpoint import load_state
 from corrsfm.training.config import AugmentConfig, Schedule, TrainConfig, TrainRecipe
 from corrsfm.training.dataset import RealPairs, generator_for
-from corrsfm.training.loop import Trainer, learning_rate_factor, train
+from corrsfm.training.loop import Trainer, learning_rate_factor, network_config, train
 
 CPU = torch.device("cpu")
 TINY = {
@@ -138,6 +138,11 @@ def test_a_run_starts_from_the_weights_of_a_checkpoint(data, tmp_path):
     assert read_provenance(tmp_path / "second" / "latest.pt")["recipe"]["train"]["initial"] == "first.pt"
     with pytest.raises(ConfigError, match=r"initial checkpoint .*first\.pt"):
         Trainer(dataclasses.replace(recipe, network={**TINY, "channels": 12}), data, CPU)
+
+
+def test_a_network_that_pruning_could_not_feed_is_refused():
+    with pytest.raises(ConfigError, match=r"side_channels is 3, expected one of \[0, 2, 5\]"):
+        network_config(TrainRecipe(network={**TINY, "side_channels": 3}))
 
 
 def test_resuming_another_network_is_refused(data, tmp_path):

@@ -27,7 +27,7 @@ import numpy as np
 from corrsfm import pipeline
 from corrsfm.config import PipelineConfig, PruneConfig, to_dict
 from corrsfm.errors import ConfigError, ReconstructionError
-from corrsfm.evaluation.records import provenance, save_results
+from corrsfm.evaluation.records import finite_or_none, provenance, save_results
 from corrsfm.evaluation.scenes.score import evaluate_scene, read_poses, score_poses
 from corrsfm.evaluation.two_view.filters import parse_prune_method
 from corrsfm.types import ModelSummary, Pair
@@ -211,8 +211,8 @@ def _measure(workspace: Workspace, failure: str | None, ground_truth: Path | Non
         "num_registered": largest.num_images if largest else 0,
         "num_points": largest.num_points if largest else 0,
         "num_observations": largest.num_observations if largest else 0,
-        "mean_track_length": _finite(largest.mean_track_length) if largest else None,
-        "mean_error_px": _finite(largest.mean_error_px) if largest else None,
+        "mean_track_length": finite_or_none(largest.mean_track_length) if largest else None,
+        "mean_error_px": finite_or_none(largest.mean_error_px) if largest else None,
         "ground_truth": score,
         "seconds": seconds,
     }
@@ -226,16 +226,11 @@ def _score(workspace: Workspace, ground_truth: Path, *, failed: bool) -> dict[st
     return score.to_dict()
 
 
-def _finite(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _models(workspace: Workspace) -> list[ModelSummary]:
-    """Summaries of the models, the largest first."""
+    """Summaries of the models, the largest first: mapping has ranked them."""
     from corrsfm.colmap.models import read_models, summarise_model
 
-    summaries = [summarise_model(model) for model in read_models(workspace.sparse)]
-    return sorted(summaries, key=lambda model: -model.num_images)
+    return [summarise_model(model) for model in read_models(workspace.sparse)]
 
 
 def _seconds(workspace: Workspace, stage: str) -> float | None:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from corrsfm.errors import InputError
-from corrsfm.evaluation.metrics import Pose, pose_auc, position_errors, relative_pose_errors
+from corrsfm.evaluation.metrics import pose_auc, position_errors, relative_pose_errors
+from corrsfm.geometry import Pose, camera_centre
 from corrsfm.workspace import Workspace
 
 __all__ = ["SCENE_THRESHOLDS_DEG", "SceneScore", "evaluate_scene", "find_model", "read_poses", "score_poses"]
@@ -59,15 +60,8 @@ class SceneScore:
         return dataclasses.asdict(self)
 
 
-def _is_model(folder: Path) -> bool:
-    # A workspace has an images.txt too, the list of its photos.
-    return any(
-        (folder / f"cameras{s}").exists() and (folder / f"images{s}").exists() for s in (".bin", ".txt")
-    )
-
-
 def find_model(folder: Path) -> Path:
-    """The model in a folder: itself, or the largest one of a workspace (``sparse/0``).
+    """The model in a folder, see `corrsfm.colmap.models.find_model`; of a workspace the largest one.
 
     Raises
     ------
@@ -76,15 +70,11 @@ def find_model(folder: Path) -> Path:
     WorkspaceError
         If the models of a workspace are older than what it now holds.
     """
-    if (folder / "workspace.json").exists() and not _is_model(folder):
+    from corrsfm.colmap import models
+
+    if (folder / "workspace.json").exists() and not models.is_model(folder):
         Workspace(folder).require("models")
-    for candidate in (folder, folder / "sparse" / "0", folder / "0"):
-        if _is_model(candidate):
-            return candidate
-    raise InputError(
-        f"{folder}: holds no COLMAP model (images.bin or images.txt) and no sparse/0; "
-        f"run: corrsfm reconstruct {folder}"
-    )
+    return models.find_model(folder)
 
 
 def read_poses(folder: Path) -> dict[str, Pose]:
@@ -106,8 +96,10 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     InputError
         If there is neither, or a file is damaged.
     """
-    if _is_model(folder):
-        return _read_colmap(folder)
+    from corrsfm.colmap.models import is_model, poses_of, read_model
+
+    if is_model(folder):
+        return poses_of(read_model(folder))
     files = sorted(folder.rglob("*.json")) if folder.is_dir() else []
     if not files:
         raise InputError(
@@ -115,23 +107,6 @@ def read_poses(folder: Path) -> dict[str, Pose]:
             "files PHOTO.json with 'rotation' and 'translation'"
         )
     return {path.relative_to(folder).as_posix().removesuffix(".json"): _read_camera(path) for path in files}
-
-
-def _read_colmap(folder: Path) -> dict[str, Pose]:
-    import pycolmap
-
-    try:
-        model = pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{folder}: COLMAP model cannot be read ({error})") from error
-    poses = {}
-    for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda image: image.name):
-        pose = image.cam_from_world()
-        poses[image.name] = (
-            np.asarray(pose.rotation.matrix(), np.float64),
-            np.asarray(pose.translation, np.float64),
-        )
-    return poses
 
 
 def _read_camera(path: Path) -> Pose:
@@ -153,14 +128,14 @@ def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneSc
     """Score camera poses against known ones; photos that only one of them has are handled as documented."""
     names = [name for name in sorted(truth) if name in poses]
     errors = relative_pose_errors(poses, truth)
-    centres = np.array([_centre(truth[name]) for name in sorted(truth)])
+    centres = np.array([camera_centre(truth[name]) for name in sorted(truth)])
     extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
     finite = errors[np.isfinite(errors)]
     distances = None
     if len(names) >= 3:
         try:
             distances = position_errors(
-                [_centre(poses[name]) for name in names], [_centre(truth[name]) for name in names]
+                [camera_centre(poses[name]) for name in names], [camera_centre(truth[name]) for name in names]
             )
         except ValueError:
             # Centres on one line leave the alignment open; the relative poses still tell.
@@ -184,11 +159,6 @@ def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneSc
     )
 
 
-def _centre(pose: Pose) -> np.ndarray:
-    rotation, translation = pose
-    return -rotation.T @ translation
-
-
 def evaluate_scene(model: Path, ground_truth: Path) -> SceneScore:
     """Measure a reconstruction against known cameras.
 
@@ -209,7 +179,7 @@ def evaluate_scene(model: Path, ground_truth: Path) -> SceneScore:
         raise InputError(
             f"{ground_truth}: only {len(truth)} known cameras; at least 2 are needed to compare poses"
         )
-    poses = _read_colmap(find_model(model))
+    poses = read_poses(find_model(model))
     if not poses.keys() & truth.keys():
         raise InputError(
             f"{model} and {ground_truth} share no photo name (such as '{next(iter(poses), 'none')}' and "

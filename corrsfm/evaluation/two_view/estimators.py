@@ -7,6 +7,7 @@ treatment of distortion. Thresholds are pixels of the original photos unless a d
 from __future__ import annotations
 
 import importlib.metadata
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -15,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.cameras import mean_focal_px, normalise_points, to_pycolmap
 from corrsfm.errors import ConfigError, DependencyError
-from corrsfm.geometry import symmetric_epipolar_distance_sq
-from corrsfm.types import Camera, Correspondences, PruneResult
+from corrsfm.geometry import pose_error_deg, symmetric_epipolar_distance_sq
+from corrsfm.labelled.oanet import OANetPair
+from corrsfm.types import Correspondences, PruneResult
 
 __all__ = [
     "ESTIMATORS",
@@ -25,6 +28,7 @@ __all__ = [
     "PoseEstimator",
     "estimator_fingerprint",
     "parse_estimator",
+    "pose_errors_deg",
     "weighted_eight_point",
 ]
 
@@ -58,6 +62,13 @@ class PoseEstimate:
     inlier_mask: NDArray[np.bool_]
 
 
+def pose_errors_deg(pose: PoseEstimate | None, pair: OANetPair) -> tuple[float, float]:
+    """Rotation and translation error of an estimate in degrees; both infinite without one."""
+    if pose is None:
+        return math.inf, math.inf
+    return pose_error_deg(pose.rotation, pose.translation, pair.rotation, pair.translation)
+
+
 PoseEstimator = Callable[[Correspondences, PruneResult, int], PoseEstimate | None]
 """Takes the matches, what a filter says of them, and a seed; None if there is no pose."""
 
@@ -72,23 +83,8 @@ def _rays(correspondences: Correspondences) -> NDArray[np.float64]:
         if camera.model in ("PINHOLE", "SIMPLE_PINHOLE"):
             sides.append(correspondences.normalised[:, columns].astype(np.float64))
         else:
-            sides.append(_pycolmap_camera(camera).cam_from_img(points.astype(np.float64)).reshape(-1, 2))
+            sides.append(normalise_points(camera, points))
     return np.hstack(sides)
-
-
-def _pycolmap_camera(camera: Camera) -> Any:
-    import pycolmap
-
-    return pycolmap.Camera(
-        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
-    )
-
-
-def _mean_focal_px(correspondences: Correspondences) -> float:
-    from corrsfm.labelled.oanet import pinhole_parameters
-
-    focals = [pinhole_parameters(c)[:2] for c in (correspondences.camera0, correspondences.camera1)]
-    return float(np.mean(focals))
 
 
 def _in_all(mask: NDArray[np.bool_], kept: NDArray[np.int64], num: int) -> NDArray[np.bool_]:
@@ -144,9 +140,9 @@ def _opencv(
         # Progressive sampling takes the best first; the ratio orders what a saturated score does not.
         kept = kept[np.lexsort((correspondences.ratios[kept], -result.scores[kept]))]
     rays = _rays(correspondences)[kept]
-    threshold = (
-        _LITERATURE_THRESHOLD if threshold_px is None else threshold_px / _mean_focal_px(correspondences)
-    )
+    threshold = _LITERATURE_THRESHOLD
+    if threshold_px is not None:
+        threshold = threshold_px / mean_focal_px(correspondences.camera0, correspondences.camera1)
     try:
         essential, mask = cv2.findEssentialMat(
             np.ascontiguousarray(rays[:, :2]),
@@ -175,7 +171,7 @@ def _opencv_fundamental(
     if len(kept) < 8:
         return None
     rays = _rays(correspondences)[kept]
-    focal = _mean_focal_px(correspondences)
+    focal = mean_focal_px(correspondences.camera0, correspondences.camera1)
     try:
         fundamental, mask = cv2.findFundamentalMat(
             np.ascontiguousarray(rays[:, :2] * focal),
@@ -214,8 +210,8 @@ def _colmap(
     found = pycolmap.estimate_essential_matrix(
         correspondences.points0[kept].astype(np.float64),
         correspondences.points1[kept].astype(np.float64),
-        _pycolmap_camera(correspondences.camera0),
-        _pycolmap_camera(correspondences.camera1),
+        to_pycolmap(correspondences.camera0),
+        to_pycolmap(correspondences.camera1),
         options,
     )
     if found is None:

@@ -17,10 +17,20 @@ from numpy.typing import NDArray
 
 from corrsfm.config import OperatingPoint, PruneConfig, PruneMethod
 from corrsfm.errors import ConfigError
+from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.labelled.oanet import OANetPair
+from corrsfm.prune.correspondences import distinctiveness
 from corrsfm.types import PruneResult
 
-__all__ = ["OracleFilter", "PairFilter", "PrunerFilter", "SideFilter", "parse_filter", "parse_prune_method"]
+__all__ = [
+    "OracleFilter",
+    "PairFilter",
+    "PrunerFilter",
+    "SideFilter",
+    "parse_filter",
+    "parse_prune_method",
+    "result_of_filter",
+]
 
 
 class PairFilter(Protocol):
@@ -44,9 +54,12 @@ class PairFilter(Protocol):
         """One result per pair, in order; matches of a pair in order; pairs without matches included."""
 
 
-def _result(pair: OANetPair, keep: NDArray[np.bool_], name: str) -> PruneResult:
-    scores = np.where(keep, 1.0 - np.clip(np.nan_to_num(pair.ratios, nan=1.0), 0.0, 1.0), 0.0)
-    return PruneResult(scores=scores.astype(np.float32), inlier_mask=keep, decided_by=name)
+def result_of_filter(
+    name: str, keep: NDArray[np.bool_], confidence: NDArray[np.float32] | float = 1.0
+) -> PruneResult:
+    """What a filter without scores of its own says: a confidence in what it keeps, none in the rest."""
+    scores = np.where(keep, confidence, 0.0).astype(np.float32)
+    return PruneResult(scores=scores, inlier_mask=keep, decided_by=name)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +90,8 @@ class SideFilter:
         results = []
         for pair in pairs:
             keep = np.ones(len(pair), bool) if self.max_ratio is None else pair.ratios <= self.max_ratio
-            results.append(_result(pair, keep & pair.mutual if self.mutual else keep, self.name))
+            keep = keep & pair.mutual if self.mutual else keep
+            results.append(result_of_filter(self.name, keep, distinctiveness(pair.ratios)))
         return results
 
 
@@ -85,7 +99,7 @@ class SideFilter:
 class OracleFilter:
     """Keep exactly the right matches: what a perfect filter would leave, the ceiling of all others."""
 
-    threshold: float = 1e-4
+    threshold: float = INLIER_THRESHOLD
     name: str = "oracle"
 
     @property
@@ -93,7 +107,10 @@ class OracleFilter:
         return f"{self.name} {self.threshold}"
 
     def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
-        return [_result(pair, pair.inliers(self.threshold), self.name) for pair in pairs]
+        return [
+            result_of_filter(self.name, pair.inliers(self.threshold), distinctiveness(pair.ratios))
+            for pair in pairs
+        ]
 
 
 class PrunerFilter:

@@ -17,8 +17,15 @@ from numpy.typing import NDArray
 
 from corrsfm.config import FeaturesConfig, to_dict
 from corrsfm.errors import InputError
-from corrsfm.evaluation.metrics import auc_contributions, bootstrap_mean, homography_corner_error, pose_auc
-from corrsfm.evaluation.records import kept_methods, provenance, save_results
+from corrsfm.evaluation.metrics import homography_corner_error, pose_auc
+from corrsfm.evaluation.records import (
+    auc_intervals,
+    by_threshold,
+    finite_or_none,
+    kept_methods,
+    provenance,
+    save_results,
+)
 from corrsfm.evaluation.two_view.filters import PairFilter, parse_filter
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import Camera, Features, PruneResult
@@ -256,9 +263,7 @@ def evaluate_homography(
             "fingerprint": pair_filter.fingerprint,
             "measured": provenance(seed=seed, command=command, device=device),
             "summary": _summarise(errors, kept, seed),
-            "pairs": {
-                "corner_error_px": {n: round(e, 4) if np.isfinite(e) else None for n, e in errors.items()}
-            },
+            "pairs": {"corner_error_px": {n: finite_or_none(e, 4) for n, e in errors.items()}},
         }
     values = {
         "provenance": provenance(seed=seed, command=command, device=device),
@@ -298,13 +303,8 @@ def _summarise(errors: dict[str, float], kept: list[int], seed: int) -> dict[str
         "num_failed": int(np.sum(~np.isfinite(values))),
         "num_kept": round(float(np.mean(kept)), 2),
         "auc": _aucs(values),
-        "auc_interval": {},
+        "auc_interval": auc_intervals(values, CORNER_THRESHOLDS_PX, seed),
     }
-    for threshold in CORNER_THRESHOLDS_PX:
-        interval = bootstrap_mean(auc_contributions(values, threshold), seed=seed)
-        summary["auc_interval"][f"{threshold:g}"] = [
-            round(value, 3) for value in (interval.mean, interval.low, interval.high)
-        ]
     for prefix, label in (("i_", "illumination"), ("v_", "viewpoint")):
         if (kinds == prefix).any():
             summary[f"auc_{label}"] = _aucs(values[kinds == prefix])
@@ -312,5 +312,4 @@ def _summarise(errors: dict[str, float], kept: list[int], seed: int) -> dict[str
 
 
 def _aucs(errors: NDArray[np.float64]) -> dict[str, float]:
-    scores = pose_auc(errors, CORNER_THRESHOLDS_PX)
-    return {f"{t:g}": round(score, 3) for t, score in zip(CORNER_THRESHOLDS_PX, scores, strict=True)}
+    return by_threshold(pose_auc(errors, CORNER_THRESHOLDS_PX), CORNER_THRESHOLDS_PX)

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import DependencyError
+from corrsfm.evaluation.two_view.filters import result_of_filter
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import Correspondences, PruneResult
 
@@ -28,10 +29,6 @@ __all__ = ["AdalamFilter", "GmsFilter"]
 _FEWEST_MATCHES = 16
 # Both packages bring a module cv2; only one of them can be installed.
 _OPENCV = "opencv-python-headless"
-
-
-def _result(keep: NDArray[np.bool_], name: str) -> PruneResult:
-    return PruneResult(scores=keep.astype(np.float32), inlier_mask=keep, decided_by=name)
 
 
 def _finite(pair: Correspondences) -> NDArray[np.intp]:
@@ -57,8 +54,8 @@ class GmsFilter:
             raise DependencyError("opencv-contrib-python-headless", f"{self.name}, instead of {_OPENCV},")
 
     def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
-        """Filter pairs; see `corrsfm.evaluation.filters.PairFilter`."""
-        return [_result(self._keep(pair.as_correspondences()), self.name) for pair in pairs]
+        """Filter pairs; see `corrsfm.evaluation.two_view.filters.PairFilter`."""
+        return [result_of_filter(self.name, self._keep(pair.as_correspondences())) for pair in pairs]
 
     def _keep(self, pair: Correspondences) -> NDArray[np.bool_]:
         keep = np.zeros(len(pair), bool)
@@ -108,8 +105,8 @@ class AdalamFilter:
         return kornia
 
     def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
-        """Filter pairs; see `corrsfm.evaluation.filters.PairFilter`."""
-        return [_result(self._keep(pair.as_correspondences()), self.name) for pair in pairs]
+        """Filter pairs; see `corrsfm.evaluation.two_view.filters.PairFilter`."""
+        return [result_of_filter(self.name, self._keep(pair.as_correspondences())) for pair in pairs]
 
     def _keep(self, pair: Correspondences) -> NDArray[np.bool_]:
         import torch

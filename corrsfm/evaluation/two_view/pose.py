@@ -13,22 +13,30 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import ConfigError, InputError
 from corrsfm.evaluation.metrics import (
+    POSE_THRESHOLDS_DEG,
     auc_contributions,
-    bootstrap_mean,
     paired_bootstrap,
     pose_auc,
     pose_map,
     precision_recall_f,
 )
-from corrsfm.evaluation.records import kept_methods, provenance, save_results
+from corrsfm.evaluation.records import (
+    auc_intervals,
+    by_threshold,
+    finite_or_none,
+    kept_methods,
+    provenance,
+    rounded_interval,
+    save_results,
+)
+from corrsfm.evaluation.two_view.estimators import pose_errors_deg
 from corrsfm.evaluation.two_view.methods import MethodOutput, TwoViewMethod, parse_method
 from corrsfm.files import sha256_of
-from corrsfm.geometry import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_sq
+from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, symmetric_epipolar_distance_sq
 from corrsfm.labelled.compact import is_compact, read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair, read_pairs
 
 __all__ = [
-    "POSE_THRESHOLDS_DEG",
     "PairScores",
     "evaluate_pose",
     "load_labelled_pairs",
@@ -36,8 +44,6 @@ __all__ = [
     "summarise",
 ]
 
-POSE_THRESHOLDS_DEG = (5.0, 10.0, 20.0)
-INLIER_THRESHOLD = 1e-4
 _BATCH = 8
 
 _PER_PAIR = (
@@ -83,8 +89,8 @@ class PairScores:
     precision, recall, f_score : (P,) float64
         Percent; of the matches the filter keeps.
     pose_precision, pose_recall, pose_f_score : (P,) float64
-        Percent; of all matches closer than 1e-4 to the estimated pose, the convention of papers that judge
-        the network's essential matrix.
+        Percent; of all matches within `INLIER_THRESHOLD` of the estimated pose, as papers do that judge the
+        network's essential matrix.
     num_kept : (P,) float64
     filter_seconds, estimator_seconds : (P,) float64
     """
@@ -108,22 +114,15 @@ class PairScores:
 
 
 def _score_one(pair: OANetPair, output: MethodOutput) -> dict[str, float]:
-    inliers = pair.inliers(INLIER_THRESHOLD)
+    inliers = pair.inliers()
     kept = precision_recall_f(output.result.inlier_mask, inliers)
-    rotation_error = translation_error = math.inf
     by_pose = (0.0, 0.0, 0.0)
     if output.pose is not None:
-        rotation, translation = output.pose.rotation, output.pose.translation
-        rotation_error, translation_error = pose_error_deg(
-            rotation, translation, pair.rotation, pair.translation
-        )
-        distances = symmetric_epipolar_distance_sq(
-            essential_from_pose(rotation, translation), pair.correspondences
-        )
+        essential = essential_from_pose(output.pose.rotation, output.pose.translation)
+        distances = symmetric_epipolar_distance_sq(essential, pair.correspondences)
         by_pose = precision_recall_f(distances < INLIER_THRESHOLD, inliers)
     values = (
-        rotation_error,
-        translation_error,
+        *pose_errors_deg(output.pose, pair),
         *kept,
         *by_pose,
         float(output.result.inlier_mask.sum()),
@@ -190,19 +189,16 @@ def summarise(
     summary: dict[str, Any] = {
         "num_pairs": len(errors),
         "num_failed": int(np.sum(~np.isfinite(errors))),
-        "auc": _by_threshold(pose_auc(errors, POSE_THRESHOLDS_DEG)),
-        "map": _by_threshold(pose_map(errors, POSE_THRESHOLDS_DEG)),
-        "auc_interval": {
-            _key(t): _interval(bootstrap_mean(auc_contributions(errors, t), seed=seed))
-            for t in POSE_THRESHOLDS_DEG
-        },
+        "auc": by_threshold(pose_auc(errors)),
+        "map": by_threshold(pose_map(errors)),
+        "auc_interval": auc_intervals(errors, POSE_THRESHOLDS_DEG, seed),
     }
     for name in _PER_PAIR[2:]:
         summary[name] = round(float(np.mean(getattr(scores, name))), 6)
     if baseline is not None:
         other = baseline.pose_error_deg
         summary["auc_minus_baseline"] = {
-            _key(t): _interval(
+            f"{t:g}": rounded_interval(
                 paired_bootstrap(auc_contributions(errors, t), auc_contributions(other, t), seed=seed)
             )
             for t in POSE_THRESHOLDS_DEG
@@ -211,31 +207,15 @@ def summarise(
     summary["scenes"] = {
         scene: {
             "num_pairs": int(np.sum(members == scene)),
-            "auc": _by_threshold(pose_auc(errors[members == scene], POSE_THRESHOLDS_DEG)),
+            "auc": by_threshold(pose_auc(errors[members == scene])),
         }
         for scene in sorted(set(scenes))
     }
     return summary
 
 
-def _key(threshold: float) -> str:
-    return f"{threshold:g}"
-
-
-def _by_threshold(values: Sequence[float]) -> dict[str, float]:
-    return {_key(t): round(value, 3) for t, value in zip(POSE_THRESHOLDS_DEG, values, strict=True)}
-
-
-def _interval(interval: Any) -> list[float]:
-    return [round(interval.mean, 3), round(interval.low, 3), round(interval.high, 3)]
-
-
 def _to_json(scores: PairScores) -> dict[str, list[float | None]]:
-    """Per-pair values, rounded to what matters; JSON has no infinity, so a failure is null."""
-    return {
-        name: [round(float(v), 5) if np.isfinite(v) else None for v in getattr(scores, name)]
-        for name in _PER_PAIR
-    }
+    return {name: [finite_or_none(value, 5) for value in getattr(scores, name)] for name in _PER_PAIR}
 
 
 def _from_json(values: dict[str, list[float | None]]) -> PairScores:
