@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.camera import CAMERA_PARAMETERS, Camera
 from corrsfm.errors import InputError
-from corrsfm.types import CAMERA_PARAMETERS, Camera
 
 if TYPE_CHECKING:
     import pycolmap

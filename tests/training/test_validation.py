@@ -1,6 +1,5 @@
 """Validation measures what `corrsfm evaluate pose` measures, with the same filter and estimator."""
 
-
 import numpy as np
 import pytest
 import torch
