@@ -18,7 +18,7 @@ from corrsfm.report import charts, pictures
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.model_view import ModelView, make_view, plotly_view
 from corrsfm.report.statistics import SceneReport
-from corrsfm.report.style import STYLE
+from corrsfm.report.style import frame, section
 from corrsfm.report.table import statistics_rows
 from corrsfm.types import PairStatistics
 
@@ -33,12 +33,6 @@ _DRAWN_SIZE = 560
 _THUMBNAILS = 24
 _THUMBNAIL_SIZE = 120
 _LISTED_PAIRS = 300
-
-# Nothing is loaded from elsewhere; plotly compiles code at run time.
-_POLICY = (
-    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
-    "script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:"
-)
 
 
 def write_html(
@@ -71,24 +65,14 @@ def write_html(
     sections = [
         _tiles(report),
         _missing(report, images_dir),
-        _section("Model", _model_view(make_view(model))) if model is not None else "",
-        _section("Statistics", _statistics(report)),
-        _section("Distributions", _histograms(report, model)),
-        _section("View graph", _view_graph(report)),
-        _section("Matches", _matches(report, images_dir, load_matches)),
-        _section("Run", _run(report)),
+        section("Model", _model_view(make_view(model))) if model is not None else "",
+        section("Statistics", _statistics(report)),
+        section("Distributions", _histograms(report, model)),
+        section("View graph", _view_graph(report)),
+        section("Matches", _matches(report, images_dir, load_matches)),
+        section("Run", _run(report)),
     ]
-    title = html.escape(report.scene)
-    text = (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{title} · corrsfm</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        f"<header><h1>{title}</h1><p>{_subtitle(report)}</p></header>\n<main>\n"
-        + "\n".join(section for section in sections if section)
-        + "\n</main>\n</body>\n</html>\n"
-    )
-    atomic_write_text(path, text)
+    atomic_write_text(path, frame(report.scene, _subtitle(report), "\n".join(filter(None, sections))))
 
 
 def _subtitle(report: SceneReport) -> str:
@@ -96,10 +80,6 @@ def _subtitle(report: SceneReport) -> str:
     method = next((section["method"] for section in sections if "method" in section), None)
     made_by = f"corrsfm {report.versions['corrsfm']}" if "corrsfm" in report.versions else "corrsfm"
     return html.escape(f"Reconstruction by {made_by}" + (f", matches pruned by {method}" if method else ""))
-
-
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{title}</h2>\n{body}\n</section>" if body else ""
 
 
 def _tiles(report: SceneReport) -> str:
@@ -149,7 +129,7 @@ def _missing(report: SceneReport, images_dir: Path | None) -> str:
         for index, image in enumerate(report.missing)
     )
     noun = "photo is" if len(report.missing) == 1 else "photos are"
-    return _section(
+    return section(
         f"{len(report.missing)} {noun} not registered",
         f'<div class="scroll tall"><table class="missing">{rows}</table></div>',
     )

@@ -1,6 +1,18 @@
-"""The look of the page: dark on light, for phones, wide screens and paper."""
+"""The frame and look of every page: dark on light, for phones, wide screens and paper."""
 
-STYLE = """
+from __future__ import annotations
+
+import html
+
+__all__ = ["frame", "section"]
+
+# Nothing is loaded from elsewhere; plotly compiles code at run time.
+_POLICY = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'unsafe-eval' blob:; worker-src blob:"
+)
+
+_STYLE = """
 :root { --ink: #22262b; --quiet: #5c6670; --line: #d9d7d0; --paper: #faf9f6; --card: #ffffff;
   --bar: #2f6f9f; }
 * { box-sizing: border-box; }
@@ -55,6 +67,11 @@ svg .axis { font-size: 12.5px; fill: var(--ink); }
 .white { background: #ffffff; }
 summary { cursor: pointer; color: var(--quiet); padding: 6px 0; }
 ol, pre { font-size: .85rem; overflow: auto; max-height: 320px; overflow-wrap: anywhere; }
+.best { font-weight: 600; }
+.failure { color: #a33; }
+.numbers td.failure { text-align: left; }
+.kept { color: #2a7fb8; }
+.dropped { color: #d55e00; }
 @media (max-width: 720px) {
   header, main { padding-left: 12px; padding-right: 12px; }
   section { padding: 14px 12px; }
@@ -63,3 +80,28 @@ ol, pre { font-size: .85rem; overflow: auto; max-height: 320px; overflow-wrap: a
 }
 @media print { section { break-inside: avoid; } body { background: #ffffff; } }
 """
+
+
+def frame(title: str, subtitle: str, body: str) -> str:
+    """A whole page that needs no other file.
+
+    Parameters
+    ----------
+    title : str
+        Plain text.
+    subtitle, body : str
+        HTML.
+    """
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{html.escape(title)} · corrsfm</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
+        f"<header><h1>{html.escape(title)}</h1><p>{subtitle}</p></header>\n<main>\n{body}\n</main>\n"
+        "</body>\n</html>\n"
+    )
+
+
+def section(title: str, body: str) -> str:
+    """A section under a heading, both HTML; nothing if the body is empty."""
+    return f"<section><h2>{title}</h2>\n{body}\n</section>" if body else ""

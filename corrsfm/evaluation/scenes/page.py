@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.files import atomic_write_text
+from corrsfm.report.style import frame, section
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
@@ -22,20 +23,6 @@ __all__ = ["write_page"]
 
 _NUM_DRAWN_PAIRS = 4
 _PHOTO_SIZE = 360
-
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
-body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom }
-th:first-child, td:first-child { text-align: left }
-.best { font-weight: 600 }
-.failure { color: #a33 } td.failure { text-align: left }
-.wide { overflow-x: auto }
-.pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(24rem, 1fr)); gap: 1rem }
-figure { margin: 0 } img { max-width: 100% } figcaption, .note { color: #555; font-size: .9em }
-.kept { color: #2a7fb8 } .dropped { color: #d55e00 }
-"""
 
 _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
     # heading, value, decimals, and +1 / -1 where more / less is better
@@ -72,24 +59,25 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
     workspaces : dict
         Method to its workspace.
     """
-    subject = values["subject"]
-    versions = ", ".join(f"{name} {version}" for name, version in values["provenance"]["versions"].items())
-    title = f"{escape(subject['name'])}: prune methods compared"
-    parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1>",
-        f"<p>{subject['num_photos']} photos, {subject['num_pairs']} pairs; the same features and matches for "
-        "every method. Numbers of the largest model; the best of a column is bold.</p>",
-        _table(values["methods"]),
-        "<h2>Pairs that differ most</h2>",
+    subject, provenance = values["subject"], values["provenance"]
+    versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
+    subtitle = (
+        f"{subject['num_photos']} photos, {subject['num_pairs']} pairs; the same features and matches for "
+        "every method. Numbers of the largest model; the best of a column is bold."
+    )
+    legend = (
         "<p class='note'>By number of verified matches. <span class='kept'>Blue: kept</span>, "
-        "<span class='dropped'>orange: dropped</span>; at most 150 and 60 are drawn.</p>",
-        *_drawn_pairs(values["pairs"][:_NUM_DRAWN_PAIRS], base, workspaces),
-        f"<p class='note'>{escape(versions)}; seed {values['provenance']['seed']}. "
-        f"{escape(values['provenance']['command'])}</p></body></html>",
+        "<span class='dropped'>orange: dropped</span>; at most 150 and 60 are drawn.</p>"
+    )
+    drawn = _drawn_pairs(values["pairs"][:_NUM_DRAWN_PAIRS], base, workspaces)
+    origin = f"{escape(versions)}; seed {provenance['seed']}. {escape(provenance['command'])}"
+    body = [
+        section("Methods", _table(values["methods"])),
+        section("Pairs that differ most", legend + "\n".join(drawn)),
+        f"<p class='note'>{origin}</p>",
     ]
-    atomic_write_text(path, "\n".join(parts))
+    title = f"{subject['name']}: prune methods compared"
+    atomic_write_text(path, frame(title, subtitle, "\n".join(body)))
 
 
 def _table(methods: dict[str, Any]) -> str:
@@ -111,7 +99,8 @@ def _table(methods: dict[str, Any]) -> str:
             rows.append(
                 f"<tr><td class='failure' colspan='{len(columns) + 1}'>{escape(method['failure'])}</td></tr>"
             )
-    return f"<div class='wide'><table><tr><th>method</th>{head}</tr>{''.join(rows)}</table></div>"
+    head_row = f"<tr><th>method</th>{head}</tr>"
+    return f"<div class='scroll'><table class='numbers'>{head_row}{''.join(rows)}</table></div>"
 
 
 def _best(numbers: Sequence[float | None], sense: int) -> float | None:
@@ -151,12 +140,12 @@ def _drawn_pairs(
             )
             kept, verified = row["kept_and_verified"][method]
             figures.append(
-                f"<figure><img src='{jpeg_uri(picture)}' alt='matches kept by {escape(method)}'>"
+                f"<figure><img src='{jpeg_uri(picture)}' class='wide' alt='matches kept by {escape(method)}'>"
                 f"<figcaption>{escape(method)}: {len(indices)} → {kept} kept → {verified} verified"
                 "</figcaption></figure>"
             )
         sections.append(
-            f"<h3>{escape(pair[0])} – {escape(pair[1])}</h3><div class='pair'>{''.join(figures)}</div>"
+            f"<h3>{escape(pair[0])} – {escape(pair[1])}</h3><div class='pairs'>{''.join(figures)}</div>"
         )
     return sections
 
