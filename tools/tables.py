@@ -99,26 +99,33 @@ def choose(table: Table, rows: dict[str, str], columns: dict[str, str], where: s
     )
 
 
-def _full_command(values: dict[str, Any]) -> str:
-    """The recorded command; of a file that may grow run by run, the last one with all methods of the file."""
+def _full_command(values: dict[str, Any]) -> list[str]:
+    """The recorded command; of a file that may grow run by run, the last one with all methods."""
     words = shlex.split(values["provenance"]["command"])
     flag = {"pose": "--method", "homography": "--filter"}.get(values["kind"])
     if flag is None:
-        return shlex.join(words)
+        return words
     rest = [
         word for position, word in enumerate(words) if flag not in words[max(position - 1, 0) : position + 1]
     ]
-    return shlex.join([*rest, *(word for name in values["methods"] for word in (flag, name))])
+    return [*rest, *(word for name in values["methods"] for word in (flag, name))]
 
 
-def _command_block(command: str) -> str:
-    """A command as a shell block, folded before flags."""
-    lines = [""]
-    for part in re.split(r" (?=--?\w)", command):
-        if lines[-1] and len(lines[-1]) + len(part) > _COMMAND_WIDTH:
+def _command_block(words: Sequence[str]) -> str:
+    """A command as a shell block; long ones are folded, a flag and its value stay together."""
+    parts: list[str] = []
+    for word in words:
+        is_value = bool(parts) and parts[-1].startswith("-") and " " not in parts[-1]
+        if is_value and not word.startswith("-"):
+            parts[-1] += f" {shlex.quote(word)}"
+        else:
+            parts.append(shlex.quote(word))
+    lines = parts[:1]
+    for part in parts[1:]:
+        if len(lines[-1]) + len(part) > _COMMAND_WIDTH:
             lines.append("   ")
         lines[-1] += f" {part}"
-    return "\n".join(["```bash", " \\\n".join(lines).strip(), "```"])
+    return "\n".join(["```bash", " \\\n".join(lines), "```"])
 
 
 def render_document(text: str, results_dir: Path, *, where: str = "document") -> str:
