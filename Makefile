@@ -1,5 +1,6 @@
 # make demo   reconstruct a bundled scene, print the statistics, write a page to look at
 # make test   the default tests (minutes); make test-slow adds the sample scenes end to end
+# make test-processors   the numeric tests as older processors round, see tests/processors.sh
 # make reference   write the command-line reference anew
 # make lint   format check, linter, type checker
 
@@ -8,7 +9,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format reference clean
+.PHONY: demo test test-slow test-processors lint format reference clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
@@ -27,6 +28,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
+
+test-processors: $(STAMP)
+	sh tests/processors.sh $(BIN)/python
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
