@@ -1,6 +1,7 @@
 # make demo   reconstruct a bundled scene, print the statistics, write a page to look at
 # make test   the default tests (minutes)
 # make test-slow   the sample scenes end to end (more minutes)
+# make test-processors   the numeric tests as older processors round, see tests/processors.sh
 # make lint   format check, linter, type checker; make format repairs what it can
 # make reference   write docs/reference.md from the commands' help
 # make tables   write the tables of README.md and results/README.md from the result files
@@ -11,7 +12,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format reference tables clean
+.PHONY: demo test test-slow test-processors lint format reference tables clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
@@ -30,6 +31,9 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -q -m slow
+
+test-processors: $(STAMP)
+	sh tests/processors.sh $(BIN)/python
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .
