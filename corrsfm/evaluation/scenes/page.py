@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.files import atomic_write_text
+from corrsfm.report.pictures import DROPPED_COLOUR, KEPT_COLOUR, draw_matches, jpeg_uri, read_photo
+from corrsfm.report.style import STYLE
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
@@ -23,18 +25,11 @@ __all__ = ["write_page"]
 _NUM_DRAWN_PAIRS = 4
 _PHOTO_SIZE = 360
 
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #222 }
-body { margin: 2rem auto; max-width: 80rem; padding: 0 1rem }
-table { border-collapse: collapse; margin: 1rem 0; font-variant-numeric: tabular-nums }
-th, td { padding: .3rem .7rem; border-bottom: 1px solid #ddd; text-align: right; vertical-align: bottom }
-th:first-child, td:first-child { text-align: left }
-.best { font-weight: 600 }
-.failure { color: #a33 } td.failure { text-align: left }
-.wide { overflow-x: auto }
-.pair { display: grid; grid-template-columns: repeat(auto-fill, minmax(24rem, 1fr)); gap: 1rem }
-figure { margin: 0 } img { max-width: 100% } figcaption, .note { color: #555; font-size: .9em }
-.kept { color: #2a7fb8 } .dropped { color: #d55e00 }
+_STYLE = f"""{STYLE}
+.best {{ font-weight: 600 }}
+.numbers td.failure {{ color: #a33; text-align: left }}
+figure img {{ max-width: 100% }}
+.kept {{ border-bottom: 3px solid {KEPT_COLOUR} }} .dropped {{ border-bottom: 3px solid {DROPPED_COLOUR} }}
 """
 
 _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
@@ -78,16 +73,16 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         f"<title>{title}</title><style>{_STYLE}</style></head><body>",
-        f"<h1>{title}</h1>",
+        f"<header><h1>{title}</h1>",
         f"<p>{subject['num_photos']} photos, {subject['num_pairs']} pairs; the same features and matches for "
-        "every method. Numbers of the largest model; the best of a column is bold.</p>",
-        _table(values["methods"]),
-        "<h2>Pairs that differ most</h2>",
+        "every method. Numbers of the largest model; the best of a column is bold.</p></header>",
+        f"<main><section>{_table(values['methods'])}</section>",
+        "<section><h2>Pairs that differ most</h2>",
         "<p class='note'>By number of verified matches. <span class='kept'>Blue: kept</span>, "
         "<span class='dropped'>orange: dropped</span>; at most 150 and 60 are drawn.</p>",
         *_drawn_pairs(values["pairs"][:_NUM_DRAWN_PAIRS], base, workspaces),
-        f"<p class='note'>{escape(versions)}; seed {values['provenance']['seed']}. "
-        f"{escape(values['provenance']['command'])}</p></body></html>",
+        f"</section><p class='note'>{escape(versions)}; seed {values['provenance']['seed']}. "
+        f"{escape(values['provenance']['command'])}</p></main></body></html>",
     ]
     atomic_write_text(path, "\n".join(parts))
 
@@ -111,7 +106,8 @@ def _table(methods: dict[str, Any]) -> str:
             rows.append(
                 f"<tr><td class='failure' colspan='{len(columns) + 1}'>{escape(method['failure'])}</td></tr>"
             )
-    return f"<div class='wide'><table><tr><th>method</th>{head}</tr>{''.join(rows)}</table></div>"
+    body = f"<tr><th>method</th>{head}</tr>{''.join(rows)}"
+    return f"<div class='scroll'><table class='numbers'>{body}</table></div>"
 
 
 def _best(numbers: Sequence[float | None], sense: int) -> float | None:
@@ -126,8 +122,6 @@ def _drawn_pairs(
     rows: Sequence[dict[str, Any]], base: Workspace, workspaces: dict[str, Workspace]
 ) -> list[str]:
     """One section per pair with a picture per method."""
-    from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
-
     oriented = {frozenset(pair): pair for pair in read_pairs(base).pairs}
     features, putative = ItemStore(base.features, FEATURES), ItemStore(base.matches, MATCHES)
     photo = functools.lru_cache(maxsize=2 * _NUM_DRAWN_PAIRS)(
@@ -156,7 +150,7 @@ def _drawn_pairs(
                 "</figcaption></figure>"
             )
         sections.append(
-            f"<h3>{escape(pair[0])} – {escape(pair[1])}</h3><div class='pair'>{''.join(figures)}</div>"
+            f"<h3>{escape(pair[0])} – {escape(pair[1])}</h3><div class='pairs'>{''.join(figures)}</div>"
         )
     return sections
 
