@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
 
 __all__ = [
+    "NO_AUGMENTATION",
     "AugmentConfig",
     "PrepareConfig",
     "Schedule",
@@ -66,6 +67,12 @@ class AugmentConfig:
         minimum=0,
     )
     thin_probability: float = option(0.3, "Drop up to 85 % of the right matches", minimum=0)
+
+
+NO_AUGMENTATION = AugmentConfig(
+    **{entry.name: 0.0 for entry in fields(AugmentConfig) if entry.name.endswith("probability")}
+)
+"""Leaves pairs as they are."""
 
 
 class Schedule(StrEnum):

@@ -9,57 +9,34 @@ schedule, so that the learning rate reaches zero when the time does. A run folde
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
-import math
 import os
-import platform
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from corrsfm import __version__
 from corrsfm.config import from_dict, to_dict
-from corrsfm.errors import ConfigError, DependencyError
+from corrsfm.errors import ConfigError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
 from corrsfm.prune.correspondences import SIDE_LAYOUTS
 from corrsfm.training.checkpoint import Average, load_state, save_state
-from corrsfm.training.config import Schedule, TrainRecipe
+from corrsfm.training.config import TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
+from corrsfm.training.journal import Journal, described_recipe, hardware
 from corrsfm.training.losses import classification_loss, essential_loss, virtual_points
+from corrsfm.training.schedule import learning_rate_factor
 from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
 
-__all__ = ["Trainer", "initial_network", "learning_rate_factor", "network_config", "train"]
+__all__ = ["Trainer", "initial_network", "network_config", "train"]
 
 logger = logging.getLogger(__name__)
-
-
-def learning_rate_factor(progress: float, warm_up: float, schedule: Schedule) -> float:
-    """Share of the largest learning rate at a progress in [0, 1].
-
-    Parameters
-    ----------
-    progress : float
-    warm_up : float
-        Share of the run in which the rate rises.
-    schedule : Schedule
-        One-cycle rises along a cosine from 1/25, cosine along a line from zero; both fall along a cosine.
-    """
-    if progress < warm_up:
-        rising = progress / warm_up
-        if schedule is Schedule.ONE_CYCLE:
-            return 0.04 + 0.96 * 0.5 * (1 - math.cos(math.pi * rising))
-        return rising
-    falling = min((progress - warm_up) / max(1 - warm_up, 1e-9), 1.0)
-    return 0.5 * (1 + math.cos(math.pi * falling))
 
 
 def train(
@@ -183,7 +160,6 @@ class Trainer:
         on_log: Callable[[dict[str, Any]], None] | None = None,
     ) -> None:
         self.recipe, self.config, self.data, self.device, self.rank = recipe, recipe.train, data, device, rank
-        self._on_log = on_log
         torch.manual_seed(self.config.seed)
         self.network = initial_network(recipe).to(device)
         self._synthetic = SyntheticPairs(recipe.synthetic, device)
@@ -199,8 +175,7 @@ class Trainer:
         self.step = self.num_skipped = 0
         self.minutes = 0.0
         self._validation: Validation | None = None
-        self._writer: Any = None
-        self.config.output.mkdir(parents=True, exist_ok=True)
+        self._journal = Journal(self.config.output, tensorboard=self.config.tensorboard, on_row=on_log)
         self.state_path = self.config.output / "state.pt"
 
     @property
@@ -213,7 +188,7 @@ class Trainer:
     def run(self) -> Path:
         """Train to the end; returns the path of the averaged weights."""
         if self.rank == 0:
-            self._write_recipe()
+            self._journal.write_recipe(self._provenance())
         started = time.monotonic() - 60.0 * self.minutes
         last = {"log": self.minutes, "save": self.minutes, "validate": self.minutes}
         sums: dict[str, float] = {}
@@ -344,9 +319,7 @@ class Trainer:
         }
         row["baseline_auc5"] = round(self._validation.baseline["auc5"], 3)
         row |= {f"auc5_{scene}": round(value, 3) for scene, value in result["by_scene"].items()}
-        self._write_row("validation.csv", row)
-        if self._on_log:
-            self._on_log(row)
+        self._journal.append("validation", row)
         return result
 
     def _averaged(self) -> CorrAdaptor:
@@ -372,48 +345,18 @@ class Trainer:
             for name in ("loss", "classification", "essential", "gradient")
         }
         row["skipped"] = self.num_skipped
-        self._write_row("log.csv", row)
-        if self._on_log:
-            self._on_log(row)
-
-    def _write_row(self, name: str, row: dict[str, Any]) -> None:
-        """Append to a CSV file, and to TensorBoard if wanted."""
-        _append_csv(self.config.output / name, row)
-        if not self.config.tensorboard:
-            return
-        if self._writer is None:
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError as error:
-                raise DependencyError("tensorboard", "--tensorboard", "train") from error
-            self._writer = SummaryWriter(str(self.config.output))
-        for key, value in row.items():
-            if key != "step" and math.isfinite(value):
-                self._writer.add_scalar(f"{Path(name).stem}/{key}", value, row["step"])
+        self._journal.append("log", row)
 
     def _provenance(self) -> dict[str, Any]:
-        recipe = json.loads(json.dumps(to_dict(self.recipe), default=str))
-        # Names say what was used; where it lay is nobody's business.
-        recipe["train"]["train_files"] = [path.name for path in self.config.train_files]
-        recipe["train"]["output"] = self.config.output.name
-        recipe["train"]["initial"] = Path(self.config.initial).name
-        if self.config.val_file is not None:
-            recipe["train"]["val_file"] = self.config.val_file.name
         return {
             "scenes": list(self.data.scene_names),
             "num_pairs": self.data.num_pairs,
             "steps": self.step,
             "minutes": round(self.minutes, 1),
             "seed": self.config.seed,
-            "recipe": recipe,
-            "hardware": f"{self.device.type}, {platform.machine()}, {torch.get_num_threads()} threads",
-            "versions": {"corrsfm": __version__, "torch": str(torch.__version__), "numpy": np.__version__},
+            "recipe": described_recipe(self.recipe),
+            **hardware(self.device),
         }
-
-    def _write_recipe(self) -> None:
-        (self.config.output / "recipe.json").write_text(
-            json.dumps(self._provenance(), indent=1, default=str) + "\n", encoding="utf-8"
-        )
 
 
 def _parameter_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
@@ -423,12 +366,3 @@ def _parameter_groups(network: nn.Module, weight_decay: float) -> list[dict[str,
         {"params": [parameter for parameter in trained if parameter.ndim > 1], "weight_decay": weight_decay},
         {"params": [parameter for parameter in trained if parameter.ndim <= 1], "weight_decay": 0.0},
     ]
-
-
-def _append_csv(path: Path, row: dict[str, Any]) -> None:
-    new = not path.exists()
-    with path.open("a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, row)
-        if new:
-            writer.writeheader()
-        writer.writerow(row)

@@ -9,14 +9,14 @@ matcher could have mistaken for theirs.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from corrsfm.training.config import AugmentConfig, SyntheticConfig
+from corrsfm.training.config import NO_AUGMENTATION, SyntheticConfig
 from corrsfm.training.dataset import Batch, RealPairs, generator_for
 from corrsfm.training.statistics import MEASURED, SideStatistics
 
@@ -76,12 +76,9 @@ def draw_both(
     device = torch.device("cpu")
     real = RealPairs.from_files(paths, device)
     synthetic = SyntheticPairs(SyntheticConfig(), device)
-    as_they_are = AugmentConfig(
-        **{entry.name: 0.0 for entry in fields(AugmentConfig) if entry.name.endswith("probability")}
-    )
     generators = [generator_for(seed, step, 0, device) for step in range(num_batches)]
     return (
-        [real.sample(num_pairs, num_matches, as_they_are, generator) for generator in generators],
+        [real.sample(num_pairs, num_matches, NO_AUGMENTATION, generator) for generator in generators],
         [synthetic.sample(num_pairs, num_matches, generator) for generator in generators],
     )
 

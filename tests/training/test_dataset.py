@@ -8,11 +8,10 @@ import torch
 from labelled_scene import make_scene
 
 from corrsfm.prune import correspondences
-from corrsfm.training.config import AugmentConfig
+from corrsfm.training.config import NO_AUGMENTATION, AugmentConfig
 from corrsfm.training.dataset import RealPairs, augment, generator_for, side_information
 
 CPU = torch.device("cpu")
-NOTHING = AugmentConfig(**{f.name: 0.0 for f in dataclasses.fields(AugmentConfig) if "probability" in f.name})
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +32,8 @@ def test_labels_agree_with_the_compact_file(data):
 )  # fmt: skip
 def test_augmentation_keeps_labels(data, changed):
     generator = generator_for(0, 0, 0, CPU)
-    batch = data.sample(8, 40, NOTHING, generator)
-    config = dataclasses.replace(NOTHING, **{changed: 1.0})
+    batch = data.sample(8, 40, NO_AUGMENTATION, generator)
+    config = dataclasses.replace(NO_AUGMENTATION, **{changed: 1.0})
     changed_batch = augment(batch, torch.full((8, 2), 0.8), config, generator_for(1, 0, 0, CPU))
     right = batch.distances() < 1e-6
     assert right.float().mean() > 0.3
@@ -44,11 +43,11 @@ def test_augmentation_keeps_labels(data, changed):
 
 
 def test_swap_exchanges_points_and_inverts_side_information(data):
-    batch = data.sample(4, 40, NOTHING, generator_for(0, 0, 0, CPU))
+    batch = data.sample(4, 40, NO_AUGMENTATION, generator_for(0, 0, 0, CPU))
     swapped = augment(
         batch,
         torch.ones(4, 2),
-        dataclasses.replace(NOTHING, swap_probability=1.0),
+        dataclasses.replace(NO_AUGMENTATION, swap_probability=1.0),
         generator_for(1, 0, 0, CPU),
     )
     torch.testing.assert_close(swapped.correspondences, batch.correspondences[..., [2, 3, 0, 1]])
@@ -58,8 +57,8 @@ def test_swap_exchanges_points_and_inverts_side_information(data):
 
 
 def test_turning_one_photo_turns_its_keypoints(data):
-    batch = data.sample(4, 40, NOTHING, generator_for(0, 0, 0, CPU))
-    config = dataclasses.replace(NOTHING, turn_probability=1.0, max_turn_deg=20.0)
+    batch = data.sample(4, 40, NO_AUGMENTATION, generator_for(0, 0, 0, CPU))
+    config = dataclasses.replace(NO_AUGMENTATION, turn_probability=1.0, max_turn_deg=20.0)
     turned = augment(batch, torch.ones(4, 2), config, generator_for(1, 0, 0, CPU))
 
     def angle(before: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
@@ -74,7 +73,7 @@ def test_turning_one_photo_turns_its_keypoints(data):
 
 
 def test_thinning_lowers_the_share_of_right_matches(data):
-    config = dataclasses.replace(NOTHING, thin_probability=1.0)
+    config = dataclasses.replace(NO_AUGMENTATION, thin_probability=1.0)
     plain, thinned = (
         torch.stack(
             [
@@ -82,13 +81,13 @@ def test_thinning_lowers_the_share_of_right_matches(data):
                 for s in range(8)
             ]
         ).mean()
-        for c in (NOTHING, config)
+        for c in (NO_AUGMENTATION, config)
     )
     assert float(thinned) < 0.8 * float(plain)
 
 
 def test_short_pairs_are_padded_and_masked(data):
-    batch = data.sample(4, 100, NOTHING, generator_for(0, 0, 0, CPU))
+    batch = data.sample(4, 100, NO_AUGMENTATION, generator_for(0, 0, 0, CPU))
     assert batch.mask.sum(1).tolist() == [59] * 4 or batch.correspondences.shape[1] == 60
 
 

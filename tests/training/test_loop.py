@@ -13,7 +13,8 @@ from corrsfm.model import load_network, read_provenance, save_network
 from corrsfm.training.checkpoint import load_state
 from corrsfm.training.config import AugmentConfig, Schedule, TrainConfig, TrainRecipe
 from corrsfm.training.dataset import RealPairs, generator_for
-from corrsfm.training.loop import Trainer, learning_rate_factor, network_config, train
+from corrsfm.training.loop import Trainer, network_config, train
+from corrsfm.training.schedule import learning_rate_factor
 
 CPU = torch.device("cpu")
 TINY = {

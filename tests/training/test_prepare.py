@@ -11,7 +11,7 @@ from corrsfm.errors import ConfigError, InputError
 from corrsfm.labelled.compact import read_scenes
 from corrsfm.labelled.oanet import read_pairs
 from corrsfm.model import CorrAdaptor, NetworkConfig
-from corrsfm.training.config import AugmentConfig, PrepareConfig, load_recipe
+from corrsfm.training.config import NO_AUGMENTATION, PrepareConfig, load_recipe
 from corrsfm.training.dataset import RealPairs, generator_for
 from corrsfm.training.loop import network_config
 from corrsfm.training.prepare import (
@@ -97,12 +97,9 @@ def test_both_layouts_train_alike(small_scene, tmp_path):
     assert len(read_scenes(tmp_path / "pairs.h5")) == 1
     assert len(list(read_pairs(tmp_path / "oanet.h5"))) == 3
     device = torch.device("cpu")
-    nothing = AugmentConfig(
-        **{name: 0.0 for name in AugmentConfig.__dataclass_fields__ if name.endswith("probability")}
-    )
     compact, oanet = (
         RealPairs.from_files([tmp_path / name], device).sample(
-            4, 200, nothing, generator_for(0, 0, 0, device)
+            4, 200, NO_AUGMENTATION, generator_for(0, 0, 0, device)
         )
         for name in ("pairs.h5", "oanet.h5")
     )
