@@ -36,7 +36,7 @@ def read_arrays(file: Path) -> dict[str, Tensor]:
         If it is damaged or holds something other than numbers.
     """
     try:
-        with np.load(file, allow_pickle=False) as arrays:
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as arrays:
             return {name: torch.as_tensor(arrays[name]) for name in arrays}
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read ({error.strerror or error})") from error

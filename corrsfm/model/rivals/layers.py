@@ -61,7 +61,7 @@ class Stack(nn.Sequential):
         while layers:
             match layers:
                 case [InstanceNorm() as instance, BatchNorm() as norm, *layers]:
-                    x = normalise(x, norm, instance.eps, mask)
+                    x = instance_norm(x, norm, instance.eps, mask)
                 case [nn.Linear() as linear, BatchNorm() as norm, *layers]:
                     x = linear_norm(x, linear, norm, mask)
                 case [BatchNorm() as norm, *layers]:
@@ -71,6 +71,15 @@ class Stack(nn.Sequential):
                 case [layer, *layers]:
                     x = layer(x, mask)
         return x
+
+
+def instance_norm(x: Tensor, norm: BatchNorm, eps: float, mask: Tensor | None) -> Tensor:
+    """Instance and batch normalisation; padding becomes zero.
+
+    In a pair of few equal rows a variance of almost zero would otherwise scale padding up, layer by layer.
+    """
+    x = normalise(x, norm, eps, mask)
+    return x if mask is None else x.masked_fill(~mask.view(*mask.shape, *[1] * (x.ndim - 2)), 0.0)
 
 
 def batch_norm(x: Tensor, norm: BatchNorm, mask: Tensor | None) -> Tensor:
