@@ -1,6 +1,5 @@
 """All rival networks keep one contract: what goes in, what comes out, what does not matter."""
 
-import copy
 import functools
 import re
 from collections.abc import Iterator
@@ -43,14 +42,24 @@ LOGIT_SETS = {
 
 
 @functools.cache
-def _drawn_rival(architecture: str) -> Rival:
+@torch.inference_mode(False)  # what is built in inference mode is never trained
+def _drawn(architecture: str, dtype: torch.dtype) -> tuple[Rival, dict[str, Tensor]]:
     with np.load(GOLDEN_FILE) as stored:
-        return drawn_rival(architecture, str(stored[f"{architecture}/salt"]))
+        network = drawn_rival(architecture, str(stored[f"{architecture}/salt"])).to(dtype)
+    network.eval()
+    return network, {name: value.clone() for name, value in network.state_dict().items()}
 
 
-def small_rival(architecture: str) -> Rival:
-    """A narrow network in evaluation mode and float64, with the weights of the stored numbers."""
-    return copy.deepcopy(_drawn_rival(architecture))
+def small_rival(architecture: str, dtype: torch.dtype = torch.float64) -> Rival:
+    """A narrow network in evaluation mode with the weights of the stored numbers.
+
+    Tests share it, because it takes longer to build than to run; one that a test trained is set back.
+    """
+    network, state = _drawn(architecture, dtype)
+    if network.training:
+        network.load_state_dict(state)
+        network.zero_grad()
+    return network.eval()
 
 
 def tolerance_of(architecture: str) -> float:
@@ -185,7 +194,8 @@ def test_padding_changes_neither_training_statistics_nor_gradients(architecture)
         output = network(inputs, mask=mask)
         sum(logits[:, :15].square().sum() for logits in output.logits).backward()
         gradients = {name: p.grad for name, p in network.named_parameters() if p.grad is not None}
-        results.append((network.state_dict(), gradients))
+        statistics = {name: value.clone() for name, value in network.named_buffers()}
+        results.append((statistics, gradients))
     tolerance = 1e-3 if architecture == "lmcnet" else 1e-6  # of the largest: biases get sums that cancel
     for one, other in zip(*results, strict=True):
         assert one.keys() == other.keys()
@@ -197,7 +207,7 @@ def test_padding_changes_neither_training_statistics_nor_gradients(architecture)
 @every_rival
 @pytest.mark.parametrize("num_rows", range(11))
 def test_few_matches_give_finite_output(architecture, num_rows):
-    network = small_rival(architecture).float()
+    network = small_rival(architecture, torch.float32)
     with torch.inference_mode():
         output = network(two_view_pairs(2, 10)[:, :num_rows].float())
     assert_finite(output)
@@ -241,7 +251,7 @@ def degenerate_inputs() -> dict[str, Tensor]:
 @every_rival
 @pytest.mark.parametrize("name", degenerate_inputs())
 def test_degenerate_input_gives_finite_output(architecture, name):
-    network, inputs = small_rival(architecture).float(), degenerate_inputs()[name]
+    network, inputs = small_rival(architecture, torch.float32), degenerate_inputs()[name]
     with torch.inference_mode():
         assert_finite(network(inputs))
         assert_finite(network.train()(torch.cat([inputs, two_view_pairs(1, 40).float()])))
@@ -255,7 +265,7 @@ def test_degenerate_input_gives_finite_output(architecture, name):
     [name for name in degenerate_inputs() if name not in ("the same point", "zeros", "only infinities")],
 )
 def test_degenerate_input_gives_finite_gradient(architecture, name):
-    network, inputs = small_rival(architecture).float().train(), degenerate_inputs()[name]
+    network, inputs = small_rival(architecture, torch.float32).train(), degenerate_inputs()[name]
     all_terms(network(torch.cat([inputs, two_view_pairs(1, 40).float()]))).backward()
     gradients = [p.grad for p in network.parameters() if p.grad is not None]
     assert gradients and all(gradient.isfinite().all() for gradient in gradients)
