@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,31 @@ from corrsfm.model.rivals.inputs import Rival
 from corrsfm.model.rivals.lmcnet import NUM_GEOMETRIC_FEATURES, NUM_IMAGE_FEATURES
 from corrsfm.model.rivals.pointcn import from_tensorflow, is_tensorflow
 
-__all__ = ["from_published_rival", "overlap", "read_arrays", "recognise", "tensors_of"]
+__all__ = ["from_published_rival", "numbers_allowed", "overlap", "read_arrays", "recognise", "tensors_of"]
 
 # Where published checkpoints keep their tensors: most, some, LMCNet.
 STATE_KEYS = ("state_dict", "model", "network_state_dict")
 
 # Tensors that the copies beside CorrAdaptor's code add and that nothing uses.
 UNUSED = {"pgfnet": re.compile(r"\.pretrain_conv[12]\."), "ms2dgnet": re.compile(r"\.conv11\.")}
+
+
+def numbers_allowed() -> AbstractContextManager[object]:
+    """Let ``torch.load(weights_only=True)`` read NumPy's numbers: training codes store their best score.
+
+    What rebuilds a number takes its type and its bytes; other types, objects first of all, stay refused.
+    Before PyTorch 2.6 nothing can be allowed by the name that files use.
+    """
+    if torch.torch_version.TorchVersion(torch.__version__) < "2.6":
+        return nullcontext()
+    rebuild: Any = np.float64(0).__reduce__()[0]
+    allowed: list[Any] = [
+        (rebuild, "numpy.core.multiarray.scalar"),  # as NumPy 1 wrote it
+        (rebuild, "numpy._core.multiarray.scalar"),
+        np.dtype,
+        *(type(np.dtype(kind)) for kind in ("f8", "f4", "i8", "i4", "?")),
+    ]
+    return torch.serialization.safe_globals(allowed)
 
 
 def read_arrays(file: Path) -> dict[str, Tensor]:
