@@ -30,6 +30,7 @@ from corrsfm.model.network import CorrAdaptor, NetworkConfig
 from corrsfm.model.rivals import ARCHITECTURES, Rival, RivalConfig, build_rival
 from corrsfm.model.rivals.checkpoints import (
     from_published_rival,
+    numbers_allowed,
     overlap,
     read_arrays,
     recognise,
@@ -271,7 +272,8 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
     if file.suffix == ".npz":
         return dict(read_arrays(file))
     try:
-        content = torch.load(file, map_location=map_location, weights_only=True)
+        with numbers_allowed():
+            content = torch.load(file, map_location=map_location, weights_only=True)
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # what the reader stumbles over in a file that is none may be anything

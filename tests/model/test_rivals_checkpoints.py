@@ -1,6 +1,7 @@
 """Checkpoints of the rivals: published ones are recognised, everything else is refused with the reason."""
 
 import functools
+import pickle
 import re
 from pathlib import Path
 
@@ -240,6 +241,28 @@ def test_nothing_in_a_checkpoint_is_executed(tmp_path):
     for name in ("evil.pth", "evil.npz"):
         with pytest.raises(CheckpointError, match=rf"{name}: not .* read safely"):
             load_network(tmp_path / name)
+    assert not trace.exists()
+
+
+class DisguisedObject:
+    """Asks for a NumPy number of the type object."""
+
+    def __init__(self, content: object) -> None:
+        self.content = content
+
+    def __reduce__(self):
+        return np.float64(0).__reduce__()[0], (np.dtype("O"), self.content)
+
+
+def test_numbers_of_numpy_beside_the_tensors_are_read_and_objects_are_not(tmp_path):
+    network, path, trace = published_rival("oanet"), tmp_path / "model_best.pth", tmp_path / "executed"
+    content = {"state_dict": published_form(network), "best_acc": np.float64(0.5), "epoch": np.int64(3)}
+    torch.save(content, path)
+    assert_same_state(load_network(path), network)
+    for hidden in (Executed(trace), pickle.dumps(Executed(trace))):
+        torch.save({**content, "best_acc": DisguisedObject(hidden)}, path)
+        with pytest.raises(CheckpointError, match="read safely"):
+            load_network(path)
     assert not trace.exists()
 
 
