@@ -1,4 +1,4 @@
-"""The network, tensors in and out: `network` says what it computes, `weights` reads its checkpoints."""
+"""Networks, tensors in and out: `network` is CorrAdaptor, `rivals` are others, `weights` reads files."""
 
 from corrsfm.model.network import CorrAdaptor, NetworkConfig, PruningOutput
 from corrsfm.model.weights import load_network, read_provenance, save_network

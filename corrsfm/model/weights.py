@@ -7,9 +7,9 @@ A checkpoint is one file that `torch.load` reads with ``weights_only=True``::
      "state_dict": {...},     parameters and running statistics, in float32 or half precision
      "provenance": {...}}     plain values: data, licence, steps, seed, scores, ...
 
-The published format (the authors' training code: a ``state_dict`` key, names perhaps behind ``module.``)
-loads as well. Bundled checkpoints lie beside this file and are listed in `REGISTRY`; their hash is checked at
-every loading.
+The published formats load as well: of CorrAdaptor and of its rivals, tensors under ``state_dict`` or
+``model`` or bare, names perhaps behind ``module.``; PointCN's TensorFlow arrays as an ``.npz``. Bundled
+checkpoints lie beside this file and are listed in `REGISTRY`; their hash is checked at every loading.
 """
 
 from __future__ import annotations
@@ -19,15 +19,24 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
 from corrsfm.model.published import from_published
+from corrsfm.model.rivals import ARCHITECTURES, Rival, RivalConfig, build_rival
+from corrsfm.model.rivals.checkpoints import (
+    from_published_rival,
+    numbers_allowed,
+    overlap,
+    read_arrays,
+    recognise,
+    tensors_of,
+)
 
 __all__ = [
     "DEFAULT_CHECKPOINT",
@@ -41,6 +50,11 @@ __all__ = [
 ]
 
 FORMAT = "corrsfm-network-1"
+
+CORRADAPTOR = "corradaptor"
+
+# Networks share names with their ancestors; a file with fewer in common than this is of none of them.
+SMALLEST_OVERLAP = 0.5
 
 CHECKPOINT_DIR = Path(__file__).parent / "checkpoints"
 
@@ -94,13 +108,41 @@ DEFAULT_CHECKPOINT = "small-side"
 """Name of the one that is loaded when none is asked for."""
 
 
-def load_network(path: Path | str | None = None, *, map_location: str | torch.device = "cpu") -> CorrAdaptor:
-    """Network with the weights of a checkpoint, in evaluation mode, float32.
+# Without an architecture the type is the one that callers expect who load what this package trains; the file
+# decides all the same, and a caller that wants nothing else says so.
+@overload
+def load_network(
+    path: Path | str | None = None,
+    architecture: Literal["corradaptor"] = ...,
+    *,
+    map_location: str | torch.device = "cpu",
+) -> CorrAdaptor: ...
+
+
+@overload
+def load_network(
+    path: Path | str | None = None,
+    architecture: str | None = None,
+    *,
+    map_location: str | torch.device = "cpu",
+) -> Any: ...
+
+
+def load_network(
+    path: Path | str | None = None,
+    architecture: str | None = None,
+    *,
+    map_location: str | torch.device = "cpu",
+) -> Any:
+    """Network with the weights of a checkpoint, in evaluation mode, float32: a `CorrAdaptor` or a `Rival`.
 
     Parameters
     ----------
     path : path or str, optional
-        A checkpoint of either format, or the name of a bundled one. The default bundled one if not given.
+        A checkpoint of any format, or the name of a bundled one. The default bundled one if not given.
+    architecture : str, optional
+        Refuse any other network: ``corradaptor`` or one of `corrsfm.model.rivals.ARCHITECTURES`. Recognised
+        from the tensors' names where it is not given.
     map_location : str or torch.device
         Where its parameters are put.
 
@@ -109,37 +151,55 @@ def load_network(path: Path | str | None = None, *, map_location: str | torch.de
     CheckpointError
         If the file is missing, damaged, of another format or of another network; missing and unexpected keys
         are listed. If a bundled file is not the one that was released.
+    ConfigError
+        If there is no such architecture.
     """
+    if architecture not in (None, CORRADAPTOR, *ARCHITECTURES):
+        raise ConfigError(
+            f"architecture is {architecture!r}, expected one of {', '.join([CORRADAPTOR, *ARCHITECTURES])}"
+        )
     file, released_sha256 = _locate(path)
     content = _read(file, map_location, expected_sha256=released_sha256)
+    state: Any
+    network: CorrAdaptor | Rival
     if content.get("format") == FORMAT:
         config, state = _read_config(content.get("config"), file), content.get("state_dict")
+        found = config.architecture if isinstance(config, RivalConfig) else CORRADAPTOR
+        network = build_rival(config) if isinstance(config, RivalConfig) else CorrAdaptor.from_config(config)
     elif "format" in content:
         raise CheckpointError(
             f"{file}: format {content['format']!r}, expected {FORMAT!r}; try a newer corrsfm"
         )
     else:
-        config, state = NetworkConfig(), content.get("state_dict")
-        if isinstance(state, Mapping):
-            state = from_published(state)
+        state = tensors_of(content)
+        found = CORRADAPTOR if state is None else _recognise(state, file)
+        if state is not None and found == CORRADAPTOR:
+            network, state = CorrAdaptor.from_config(NetworkConfig()), from_published(state)
+        elif state is not None:
+            network, state = from_published_rival(state, found)
     if not isinstance(state, Mapping):
         raise CheckpointError(
             f"{file}: holds no 'state_dict'; expected a checkpoint of corrsfm or the published code"
         )
-    network = CorrAdaptor.from_config(config).to(map_location)
-    _fill(network, state, file)
+    if architecture not in (None, found):
+        raise CheckpointError(f"{file}: holds the network {found}, expected {architecture}")
+    _fill(network.to(map_location), state, f"{file}: not a checkpoint of this network ({found})")
     return network.eval()
 
 
 def save_network(
-    network: CorrAdaptor, path: Path | str, *, provenance: Mapping[str, Any] | None = None, half: bool = False
+    network: CorrAdaptor | Rival,
+    path: Path | str,
+    *,
+    provenance: Mapping[str, Any] | None = None,
+    half: bool = False,
 ) -> str:
     """Write a checkpoint.
 
     Parameters
     ----------
-    network : CorrAdaptor
-        Built by `CorrAdaptor.from_config`.
+    network : CorrAdaptor or Rival
+        Built by `CorrAdaptor.from_config` or `build_rival`.
     path : path or str
         Replaced in one step if it exists.
     provenance : mapping of plain values, optional
@@ -154,7 +214,7 @@ def save_network(
     """
     if network.config is None:
         raise CheckpointError(
-            f"{path}: the network has no configuration; build it with CorrAdaptor.from_config"
+            f"{path}: the network has no configuration; build it with CorrAdaptor.from_config or build_rival"
         )
     state = {}
     for name, value in network.state_dict().items():
@@ -209,8 +269,11 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
         raise CheckpointError(
             f"{file}: SHA-256 is {found}, expected {expected_sha256}; the file is damaged: reinstall corrsfm"
         )
+    if file.suffix == ".npz":
+        return dict(read_arrays(file))
     try:
-        content = torch.load(file, map_location=map_location, weights_only=True)
+        with numbers_allowed():
+            content = torch.load(file, map_location=map_location, weights_only=True)
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # what the reader stumbles over in a file that is none may be anything
@@ -228,10 +291,27 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
     return content
 
 
-def _read_config(values: Any, file: Path) -> NetworkConfig:
+def _recognise(state: Mapping[str, Any], file: Path) -> str:
+    """The architecture of a published state dict."""
+    rival, share = recognise(state)
+    with torch.device("meta"):
+        own = CorrAdaptor.from_config(NetworkConfig()).state_dict()
+    own_share = overlap(own, from_published(state))
+    if max(share, own_share) < SMALLEST_OVERLAP:
+        names = sorted(state)
+        more = "" if len(names) <= 10 else f" and {len(names) - 10} more"
+        raise CheckpointError(
+            f"{file}: no network that corrsfm knows has these {len(names)} unexpected keys: "
+            f"{', '.join(names[:10])}{more}; it knows {', '.join([CORRADAPTOR, *ARCHITECTURES])}"
+        )
+    return CORRADAPTOR if own_share >= share else rival
+
+
+def _read_config(values: Any, file: Path) -> NetworkConfig | RivalConfig:
     if not isinstance(values, dict):
         raise CheckpointError(f"{file}: holds no network configuration")
-    known = [field.name for field in dataclasses.fields(NetworkConfig)]
+    described = RivalConfig if "architecture" in values else NetworkConfig
+    known = [field.name for field in dataclasses.fields(described)]
     unknown = [str(name) for name in values if name not in known]
     if unknown:
         raise CheckpointError(
@@ -239,12 +319,12 @@ def _read_config(values: Any, file: Path) -> NetworkConfig:
         )
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
     try:
-        return NetworkConfig(**values)
+        return described(**values)
     except (ConfigError, TypeError) as error:
         raise CheckpointError(f"{file}: {error}") from error
 
 
-def _fill(network: CorrAdaptor, state: Mapping[str, Any], file: Path) -> None:
+def _fill(network: nn.Module, state: Mapping[str, Any], complaint: str) -> None:
     """Copy a state dict into a network of exactly its names and shapes."""
     own = network.state_dict()
     problems = []
@@ -260,5 +340,5 @@ def _fill(network: CorrAdaptor, state: Mapping[str, Any], file: Path) -> None:
         elif not state[name].isfinite().all():
             problems.append(f"{name} holds values that are not finite")
     if problems:
-        raise CheckpointError(f"{file}: not a checkpoint of this network: " + "; ".join(problems))
+        raise CheckpointError(f"{complaint}: " + "; ".join(problems))
     network.load_state_dict(dict(state), strict=True)
