@@ -94,7 +94,11 @@ def run_benchmark(
     list of BenchmarkRow
         Grouped by device, size and batch size; the reference first in each group.
     """
-    network = load_network(model) if model is not None else CorrAdaptor.from_config(NetworkConfig()).eval()
+    network = (
+        load_network(model, architecture="corradaptor")
+        if model is not None
+        else CorrAdaptor.from_config(NetworkConfig()).eval()
+    )
     reference = PlainCorrAdaptor().eval()
     rows: list[BenchmarkRow] = []
     for device, size, batch_size in itertools.product(devices, sizes, batch_sizes):

@@ -108,13 +108,11 @@ DEFAULT_CHECKPOINT = "small-side"
 """Name of the one that is loaded when none is asked for."""
 
 
-# Without an architecture the type is the one that callers expect who load what this package trains; the file
-# decides all the same, and a caller that wants nothing else says so.
 @overload
 def load_network(
     path: Path | str | None = None,
-    architecture: Literal["corradaptor"] = ...,
     *,
+    architecture: Literal["corradaptor"],
     map_location: str | torch.device = "cpu",
 ) -> CorrAdaptor: ...
 

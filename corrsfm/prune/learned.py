@@ -184,7 +184,7 @@ class Pruner:
         CheckpointError
             If there is no usable checkpoint.
         """
-        network = load_network(path)
+        network = load_network(path, architecture="corradaptor")
         return cls(network, checkpoint_sha256=weights.checkpoint_sha256(path), device=device, **options)
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:

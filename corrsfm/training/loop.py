@@ -110,7 +110,7 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     config = network_config(recipe)
     if not recipe.train.initial:
         return CorrAdaptor.from_config(config)
-    network = load_network(recipe.train.initial)
+    network = load_network(recipe.train.initial, architecture="corradaptor")
     assert network.config is not None
     if recipe.network and network.config != config:
         raise ConfigError(

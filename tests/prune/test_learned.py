@@ -1,5 +1,6 @@
 import dataclasses
 import logging
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from two_view_pairs import make_pair
 from corrsfm.config import OperatingPoint, Precision, PruneConfig, PruneMethod
 from corrsfm.errors import CheckpointError, CorrsfmError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
+from corrsfm.model.rivals import RivalConfig, build_rival
 from corrsfm.prune import Pruner, build_pruner
 from corrsfm.prune.learned import choose_precision, pack_batches
 from corrsfm.prune.selection import select_candidates
@@ -230,3 +232,10 @@ def test_checkpoint_is_loaded_by_the_builder_and_named_in_the_fingerprint(networ
 def test_missing_checkpoint_is_an_error_that_names_it(tmp_path):
     with pytest.raises(CheckpointError, match="nowhere.pt"):
         Pruner.load(tmp_path / "nowhere.pt", device="cpu")
+
+
+def test_a_checkpoint_of_another_network_is_refused_by_name(tmp_path: Path) -> None:
+    rival = build_rival(RivalConfig(architecture="oanet", channels=8, clusters=4))
+    save_network(rival, tmp_path / "rival.pt")
+    with pytest.raises(CheckpointError, match="oanet"):
+        Pruner.load(tmp_path / "rival.pt", device="cpu")
