@@ -10,7 +10,7 @@ from pathlib import Path
 
 from corrsfm.errors import DatabaseError
 
-__all__ = ["database_errors", "is_sqlite", "is_truncated"]
+__all__ = ["copy_database", "database_errors", "is_sqlite", "is_truncated"]
 
 
 _SMALLEST_DISK_BYTES = 1 << 20
@@ -125,3 +125,20 @@ def _is_locked(path: Path) -> bool:
     except sqlite3.OperationalError as error:
         return "locked" in str(error)
     return False
+
+
+def copy_database(source: Path, target: Path) -> None:
+    """Copy a database by SQLite itself, including its write-ahead log.
+
+    Parameters
+    ----------
+    source : Path
+        Not changed; others may read it meanwhile.
+    target : Path
+        Must not exist.
+    """
+    with (
+        contextlib.closing(sqlite3.connect(source)) as old,
+        contextlib.closing(sqlite3.connect(target)) as new,
+    ):
+        old.backup(new)

@@ -232,11 +232,21 @@ class DatabaseConfig:
     write_descriptors: bool = option(False, "Also write descriptors, for tools that need them")
 
 
+_INCREMENTAL = ("mapper", (Mapper.INCREMENTAL,))
+
+
 @dataclass(frozen=True, kw_only=True)
 class ReconstructionConfig:
     """Mapping by pycolmap."""
 
     mapper: Mapper = option(Mapper.INCREMENTAL, "Mapping pipeline")
+    max_models_tried: int = option(
+        24,
+        "Models mapped at most before one is chosen; further ones are tried only if the first does not "
+        "explain the matches; 1 takes the first as it comes",
+        minimum=1,
+        used_with=_INCREMENTAL,
+    )
     min_model_size: int = option(3, "Smallest model worth keeping", unit="photos", minimum=2)
     multiple_models: bool = option(True, "Keep several models when the photos do not connect")
     refine_intrinsics: bool = option(

@@ -12,7 +12,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-__all__ = ["focal_length_ratios", "is_plausible", "refine_intrinsics"]
+__all__ = [
+    "describe_impossible",
+    "focal_length_ratios",
+    "has_prior_focal_lengths",
+    "is_plausible",
+    "refine_intrinsics",
+]
 
 # COLMAP drops a photo beyond these while it maps, but not after the last bundle adjustment.
 _SMALLEST_RATIO, _LARGEST_RATIO = 0.1, 10.0
@@ -55,6 +61,23 @@ def is_plausible(model: pycolmap.Reconstruction) -> bool:
         return False
     factors = np.exp(np.abs(np.log(ratios / np.median(ratios))))
     return bool(np.mean(factors > _LARGEST_FACTOR) <= _LARGEST_SHARE)
+
+
+def describe_impossible(model: pycolmap.Reconstruction) -> str:
+    """Name focal lengths that no camera has; empty if there are none.
+
+    Focal lengths that differ from photo to photo are not among them: photos of many cameras, or zoomed ones,
+    do so rightly.
+    """
+    ratios = focal_length_ratios(model)
+    if not len(ratios) or (ratios[0] >= _SMALLEST_RATIO and ratios[-1] <= _LARGEST_RATIO):
+        return ""
+    return f"focal lengths from {ratios[0]:.2g} to {ratios[-1]:.2g} times the longest side"
+
+
+def has_prior_focal_lengths(model: pycolmap.Reconstruction) -> bool:
+    """Whether EXIF, the user or the votes of pairs told the focal length of every registered photo."""
+    return not len(focal_length_ratios(model))
 
 
 def refine_intrinsics(

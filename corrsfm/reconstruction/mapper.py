@@ -19,7 +19,7 @@ from corrsfm.colmap.sqlite import database_errors
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError
 from corrsfm.files import atomic_path
-from corrsfm.reconstruction.calibration import focal_length_ratios, is_plausible, refine_intrinsics
+from corrsfm.reconstruction.calibration import is_plausible, refine_intrinsics
 from corrsfm.reconstruction.failure import read_pair_graph, why_no_model
 from corrsfm.types import ModelSummary
 
@@ -40,6 +40,7 @@ def reconstruct(
     num_threads: int = 0,
     log_file: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
+    choose: Callable[[pycolmap.Reconstruction | None, float], pycolmap.Reconstruction | None] | None = None,
 ) -> list[ModelSummary]:
     """Map a database into models; they appear at ``output`` all at once or not at all.
 
@@ -63,6 +64,9 @@ def reconstruct(
     on_progress : callable, optional
         Called with the number of photos in the model under construction whenever it grows; incremental
         mapping only. An exception it raises cancels the mapping and is passed on.
+    choose : callable, optional
+        Given the largest model, None if there is none, and the seconds it took: the model to put in its
+        place. Not asked if the time limit stopped mapping.
 
     Returns
     -------
@@ -96,15 +100,20 @@ def reconstruct(
             options=_incremental_options(config, output, seed, num_threads),
             on_progress=on_progress or (lambda num_registered: None),
         )
-        cut_off = _cut_off(config, time.monotonic() - started)
+        seconds = time.monotonic() - started
+        cut_off = _cut_off(config, seconds)
         models = _ranked(mapped.values(), config.min_model_size)
+        first = models[0] if models else None
+        chosen = first if choose is None or cut_off else choose(first, seconds)
+        if chosen is not None and chosen is not first:
+            models = [chosen, *(model for model in models[1:] if not _names(model) <= _names(chosen))]
         if not models:
             raise ReconstructionError(f"{database}: {why_no_model(graph, cut_off)}")
-        _check_calibration(models[0])
         if cut_off:
             logger.warning("%s; photos may be missing for that reason alone", cut_off)
         for number, model in enumerate(models):
-            if images_dir is not None and config.mapper is not Mapper.INCREMENTAL:
+            has_colours = config.mapper is Mapper.INCREMENTAL and (number or chosen is first)
+            if images_dir is not None and not has_colours:
                 model.extract_colors_for_all_images(images_dir)
             (temporary / str(number)).mkdir()
             model.write_binary(temporary / str(number))
@@ -259,18 +268,6 @@ def _explains_more(model: pycolmap.Reconstruction | None, other: pycolmap.Recons
         return one.num_reg_images(), one.compute_num_observations()
 
     return model is not None and size(model) > size(other)
-
-
-def _check_calibration(model: pycolmap.Reconstruction) -> None:
-    """Warn of a model with implausible focal lengths."""
-    if not is_plausible(model):
-        ratios = focal_length_ratios(model)
-        logger.warning(
-            "the model looks wrong: focal lengths from %.2g to %.2g times the longest side of photos that do "
-            "not tell them in EXIF; if one camera took all, try --camera-mode single, else --mapper global",
-            ratios[0],
-            ratios[-1],
-        )
 
 
 def _interruptible(function: Callable[..., Any], *arguments: Any) -> Any:

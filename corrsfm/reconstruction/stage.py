@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import functools
 import logging
+import shutil
 import time
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.colmap.log import pycolmap_version
-from corrsfm.colmap.pairs import names_of_verified_pairs
+from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
 from corrsfm.errors import ReconstructionError, first_few
+from corrsfm.files import atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.mapper import reconstruct as map_database
+from corrsfm.reconstruction.record import record_of
+from corrsfm.reconstruction.selection import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
+from corrsfm.workspace.store import ItemStore
+
+if TYPE_CHECKING:
+    import pycolmap
 
 __all__ = ["reconstruct"]
 
@@ -56,6 +67,9 @@ def reconstruct(
             workspace.command_for("images", images_dir="NEWDIR"),
         )
     _warn_of_parts(workspace, names)
+    workspace.evidence.unlink(missing_ok=True)
+    choice = _Choice(workspace, names, config, run, workspace.candidates / fingerprint[:16])
+    chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
     with tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar:
         try:
             models = map_database(
@@ -67,13 +81,67 @@ def reconstruct(
                 num_threads=count_threads(run.threads),
                 log_file=workspace.log,
                 on_progress=functools.partial(_show_progress, bar),
+                choose=choice if chooses else None,
             )
         except ReconstructionError:
             workspace.put_models_aside()
             raise
+    if choice.selection is not None:
+        atomic_write_json(workspace.evidence, record_of(choice.selection))
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
+
+
+class _Choice:
+    """Chooses the first model with what the workspace knows; keeps the selection for the record."""
+
+    def __init__(
+        self,
+        workspace: Workspace,
+        names: list[str],
+        config: cfg.ReconstructionConfig,
+        run: cfg.RunConfig,
+        workdir: Path,
+    ) -> None:
+        self._workspace = workspace
+        self._names = names
+        self._config = config
+        self._run = run
+        self._workdir = workdir
+        self.selection: Selection | None = None
+
+    def __call__(
+        self, first: pycolmap.Reconstruction | None, seconds: float
+    ) -> pycolmap.Reconstruction | None:
+        workspace, run = self._workspace, self._run
+        # Candidates of other matches or options are of no use any more.
+        for folder in workspace.candidates.glob("*"):
+            if folder != self._workdir:
+                shutil.rmtree(folder)
+        with ItemStore(workspace.features, FEATURES).reader() as load:
+            self.selection = select_model(
+                first,
+                SceneEvidence(self._names, read_verified_matches(workspace.database), load, seed=run.seed),
+                workspace.database,
+                self._workdir,
+                policy=policy_for(self._config.max_models_tried, seconds),
+                first_seconds=seconds,
+                seed=run.seed,
+                refine_principal_point=self._config.refine_principal_point,
+                num_processes=count_threads(run.threads),
+            )
+        if workspace.candidates.is_dir():
+            shutil.rmtree(workspace.candidates)
+        if self.selection is None:
+            return None
+        choice = self.selection.choice
+        if len(choice.tried) > 1:
+            logger.info(
+                "models tried: %d (%s); chosen: %s", len(choice.tried), choice.reason, choice.chosen.name
+            )
+        logger.info("verdict: %s", self.selection.verdict)
+        return self.selection.model
 
 
 def _show_progress(bar: tqdm, num_registered: int) -> None:

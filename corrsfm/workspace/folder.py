@@ -13,6 +13,7 @@
     ├── pruned.h5           matches that passed pruning
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
+    ├── evidence.json       why the first model was chosen, and the verdict on it
     ├── sparse.old/         models of earlier matches, moved here when mapping failed
     ├── report.json, report.html
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
@@ -112,6 +113,8 @@ class Workspace:
         self.pruned = root / "pruned.h5"
         self.database = root / "database.db"
         self.sparse = root / "sparse"
+        self.evidence = root / "evidence.json"
+        self.candidates = root / ".candidates"
         self.report_json = root / "report.json"
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"
@@ -306,7 +309,7 @@ class Workspace:
         if not self.sparse.is_dir():
             self.run_json.unlink(missing_ok=True)
             return
-        for path in (self.run_json, self.report_json, self.report_html):
+        for path in (self.run_json, self.evidence, self.report_json, self.report_html):
             if path.exists():
                 os.replace(path, self.sparse / path.name)
         aside = self.sparse.with_name("sparse.old")

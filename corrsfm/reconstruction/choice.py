@@ -1,0 +1,251 @@
+"""The choice among models: how many to try, and which one to take.
+
+One mapping of a weak pair graph is a draw. The first model is taken if what it explains says that it is
+right; otherwise further candidates are mapped, in rounds, until the best one has been found a second time by
+another way, or enough has been tried. The model with the most predicted matches is chosen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.explained import Explained
+from corrsfm.reconstruction.views import Views
+
+__all__ = ["Choice", "ChoicePolicy", "Tried", "choose_model", "good_enough"]
+
+C = TypeVar("C")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ChoicePolicy:
+    """When to stop trying.
+
+    Attributes
+    ----------
+    min_explained_share : float
+        A first model that explains as much of the verified matches is good enough.
+    min_registered_share : float
+        And registers as many of the photos.
+    max_models : int
+        Models tried at most, the first one included.
+    max_time_factor : float
+        No further round once the candidates have taken this many times the first mapping; 0 for no bound.
+        The only part of the choice that depends on the machine.
+    round_size : int
+        Candidates between two decisions; fixed, so that the choice does not depend on the number of cores.
+    min_models : int
+        Models tried before the best can be confirmed.
+    confirming_share : float
+        Relative poses on which a candidate must agree with the best to confirm it.
+    confirming_predicted : float
+        Predicted matches it must reach, as a share of the best's.
+    confirming_explained : float
+        What the best must explain of the pairs that do not contradict it to be confirmed, without a misplaced
+        photo: on a weak pair graph many candidates fall into the same wrong model.
+    patience : int
+        Candidates in a row without more predicted matches after which the best stands.
+    """
+
+    min_explained_share: float = 0.94
+    min_registered_share: float = 1.0
+    max_models: int = 24
+    max_time_factor: float = 25.0
+    round_size: int = 4
+    min_models: int = 9
+    confirming_share: float = 0.9
+    confirming_predicted: float = 0.97
+    confirming_explained: float = 0.94
+    patience: int = 12
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tried:
+    """A model that has been mapped.
+
+    Attributes
+    ----------
+    name : str
+        Of the candidate.
+    views : mapping of str to View
+        Its registered photos.
+    explained : Explained
+    seconds : float
+        Of the mapping.
+    num_predicted : int or None
+        None until a choice has to be made.
+    """
+
+    name: str
+    views: Views
+    explained: Explained
+    seconds: float
+    num_predicted: int | None = None
+
+    @property
+    def explained_share(self) -> float:
+        """Explained over verified matches of the scene."""
+        return self.explained.share
+
+    @property
+    def num_registered(self) -> int:
+        """Number of registered photos."""
+        return len(self.views)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Choice:
+    """What was tried and taken.
+
+    Attributes
+    ----------
+    chosen : Tried
+    tried : tuple of Tried
+        In the order of trying, the first model first; candidates that gave no model are missing.
+    num_failed : int
+        Candidates that gave no model.
+    reason : str
+        Why no more was tried, as the end of "stopped because …".
+    support : float or None
+        Best agreement of another candidate with the chosen one, among those that predict nearly as much:
+        share of relative poses in [0, 1]. None if only the first model was looked at, 0 if the others
+        predict less.
+    """
+
+    chosen: Tried
+    tried: tuple[Tried, ...]
+    num_failed: int = 0
+    reason: str
+    support: float | None = field(default=None)
+
+
+def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
+    """Whether a first model needs no second: it explains enough, holds the photos, and misplaces none."""
+    return (
+        not model.explained.misplaced
+        and model.explained_share >= policy.min_explained_share
+        and model.num_registered >= policy.min_registered_share * num_photos
+    )
+
+
+def choose_model(
+    first: Tried,
+    bank: Sequence[C],
+    *,
+    num_photos: int,
+    map_round: Callable[[Sequence[C]], Sequence[Tried | None]],
+    count_predicted: Callable[[Views], int],
+    policy: ChoicePolicy,
+    mend: Callable[[Tried], Tried | None] = lambda model: None,
+) -> Choice:
+    """Try candidates until the best model is confirmed or the budget is spent, and choose.
+
+    Parameters
+    ----------
+    first : Tried
+    bank : sequence
+        Candidates in the order of trying.
+    num_photos : int
+        Photos of the scene.
+    map_round : callable
+        Maps some candidates, in parallel or not; one `Tried` each, in their order, None for no model.
+    count_predicted : callable
+        Number of predicted matches of a model.
+    policy : ChoicePolicy
+    mend : callable, optional
+        Registers the misplaced photos of a model again (`corrsfm.reconstruction.registration`); None if that
+        gave nothing. Asked once about every model that is the best at the end of a round; what it returns is
+        one more model to choose from.
+
+    Returns
+    -------
+    Choice
+        Of equal models the earlier is taken, so the first one stays unless another is better.
+    """
+    if good_enough(first, num_photos, policy):
+        return Choice(chosen=first, tried=(first,), reason="the first model is good enough")
+    if not bank or policy.max_models < 2:
+        return Choice(chosen=first, tried=(first,), reason="no other candidate was to be tried")
+
+    def counted(model: Tried) -> Tried:
+        return dataclasses.replace(model, num_predicted=count_predicted(model.views))
+
+    mended: set[str] = set()
+
+    def mend_best(outcomes: list[Tried | None]) -> None:
+        best = _best([model for model in outcomes if model is not None])
+        if best.explained.misplaced and best.name not in mended:
+            mended.add(best.name)
+            again = mend(best)
+            if again is not None:
+                outcomes.append(counted(again))
+
+    outcomes: list[Tried | None] = [counted(first)]
+    mend_best(outcomes)
+    reason = "all candidates have been tried"
+    for candidates in _rounds(bank[: policy.max_models - 1], policy.round_size):
+        outcomes += [None if model is None else counted(model) for model in map_round(candidates)]
+        mend_best(outcomes)
+        if why := _why_stop(outcomes, policy):
+            reason = why
+            break
+    tried = [model for model in outcomes if model is not None]
+    best = _best(tried)
+    return Choice(
+        chosen=best,
+        tried=tuple(tried),
+        num_failed=len(outcomes) - len(tried),
+        reason=reason,
+        support=_support(best, tried, policy.confirming_predicted),
+    )
+
+
+def _rounds(bank: Sequence[C], size: int) -> Iterator[Sequence[C]]:
+    return (bank[start : start + size] for start in range(0, len(bank), size))
+
+
+def _why_stop(outcomes: Sequence[Tried | None], policy: ChoicePolicy) -> str:
+    """Why no further candidate is needed; empty if one is."""
+    tried = [model for model in outcomes if model is not None]
+    best = _best(tried)
+    if (
+        len(tried) >= policy.min_models
+        and best.explained.share_of_supported >= policy.confirming_explained
+        and not best.explained.misplaced
+        and _support(best, tried, policy.confirming_predicted) >= policy.confirming_share
+    ):
+        return "another candidate confirmed the best"
+    stood = len(outcomes) - 1 - outcomes.index(best)
+    if stood >= policy.patience:
+        return f"the best stood for {stood} candidates"
+    spent = sum(model.seconds for model in tried[1:])
+    if policy.max_time_factor and spent > policy.max_time_factor * tried[0].seconds:
+        return f"the candidates took {policy.max_time_factor:g} times as long as the first model"
+    return ""
+
+
+def _best(tried: Sequence[Tried]) -> Tried:
+    """Most predicted matches, then most photos, then most explained, then the earliest."""
+
+    def rank(model: Tried) -> tuple[int, int, float]:
+        return model.num_predicted or 0, model.num_registered, model.explained_share
+
+    return max(tried, key=rank)  # the first of equals
+
+
+def _support(best: Tried, tried: Sequence[Tried], confirming_predicted: float) -> float:
+    """Best agreement with another model that predicts nearly as much, over all photos of the best."""
+    enough = confirming_predicted * (best.num_predicted or 0)
+    shares = [0.0]
+    for rival in tried:
+        if rival is best or (rival.num_predicted or 0) < enough:
+            continue
+        common = agreement(best.views, rival.views)
+        # A rival with fewer photos confirms only the pairs it has.
+        num, num_common = best.num_registered, common.num_photos
+        shares.append(common.share * num_common * (num_common - 1) / max(num * (num - 1), 1))
+    return max(shares)

@@ -1,0 +1,120 @@
+"""Candidates mapped side by side, each in a process of its own.
+
+pycolmap's mappers hold one log and one random seed per process, and a candidate on one thread is a function
+of its description alone: so processes, not threads, and the results do not depend on how many.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import multiprocessing
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from corrsfm.reconstruction.candidates import Candidate, map_candidate
+
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["CandidatePool"]
+
+logger = logging.getLogger("corrsfm")
+
+
+class CandidatePool:
+    """Maps candidates of one database, several at a time; a context manager.
+
+    Parameters
+    ----------
+    database : Path
+        With verified two-view geometries; not changed.
+    workdir : Path
+        Every candidate gets a folder of its name here and is read from it if an earlier run finished it.
+    focal_lengths_px : mapping of int to float, optional
+        See `map_candidate`.
+    refine_principal_point : bool
+    num_processes : int
+        1 maps in this process.
+    max_runtime_seconds : int
+        Of one candidate; 0 for no limit.
+    """
+
+    def __init__(
+        self,
+        database: Path,
+        workdir: Path,
+        *,
+        focal_lengths_px: Mapping[int, float] | None = None,
+        refine_principal_point: bool = False,
+        num_processes: int = 1,
+        max_runtime_seconds: int = 0,
+    ) -> None:
+        self._database = database
+        self._workdir = workdir
+        self._options = {
+            "focal_lengths_px": dict(focal_lengths_px or {}),
+            "refine_principal_point": refine_principal_point,
+            "max_runtime_seconds": max_runtime_seconds,
+        }
+        # A fork would copy pycolmap's threads in whatever state they are.
+        self._executor = (
+            ProcessPoolExecutor(num_processes, mp_context=multiprocessing.get_context("spawn"))
+            if num_processes > 1
+            else None
+        )
+
+    def __enter__(self) -> CandidatePool:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
+
+    def map(self, candidates: Sequence[Candidate]) -> list[pycolmap.Reconstruction | None]:
+        """The model of each candidate in their order, None where none came out.
+
+        Raises
+        ------
+        DatabaseError
+            If the database cannot be read.
+        """
+        if self._executor is not None:
+            jobs = [
+                (candidate, self._database, self._folder(candidate), self._options)
+                for candidate in candidates
+            ]
+            try:
+                for _ in self._executor.map(_map_in_process, jobs):
+                    pass
+            except BrokenProcessPool:
+                # Killed for memory, or started from a script without a main guard.
+                logger.warning(
+                    "a process that mapped a candidate ended abruptly; going on with one at a time"
+                )
+                self._executor.shutdown(cancel_futures=True)
+                self._executor = None
+        # Models do not travel between processes; all of them lie in their folders now.
+        return [
+            map_candidate(candidate, self._database, self._folder(candidate), **self._options)  # type: ignore[arg-type]
+            for candidate in candidates
+        ]
+
+    def seconds(self, candidate: Candidate) -> float:
+        """Seconds that a mapped candidate took, when it was mapped."""
+        values = json.loads((self._folder(candidate) / "candidate.json").read_text(encoding="utf-8"))
+        return float(values["seconds"])
+
+    def _folder(self, candidate: Candidate) -> Path:
+        return self._workdir / candidate.name
+
+
+def _map_in_process(job: tuple[Candidate, Path, Path, dict[str, object]]) -> None:
+    candidate, database, folder, options = job
+    map_candidate(candidate, database, folder, **options)  # type: ignore[arg-type]

@@ -1,0 +1,80 @@
+"""Photos in the wrong place: taken out of a model and registered again.
+
+A mapper that once put a photo in the wrong place keeps it there, and bends its neighbours. Without it the
+rest settles, and the photo mostly finds its place, or stays out.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Collection
+from pathlib import Path
+
+import pycolmap
+
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.sqlite import database_errors
+from corrsfm.reconstruction.candidates import Candidate, MapperKind, incremental_options
+
+__all__ = ["register_again"]
+
+
+def register_again(
+    model: pycolmap.Reconstruction,
+    names: Collection[str],
+    database: Path,
+    workdir: Path,
+    *,
+    seed: int = 0,
+    refine_principal_point: bool = False,
+    num_threads: int = 1,
+) -> pycolmap.Reconstruction | None:
+    """Take photos out of a model, and go on mapping from there with lenient thresholds.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        Not changed.
+    names : collection of str
+        Photos to take out, such as `Explained.misplaced`.
+    database : Path
+        The verified matches that the model was made from; not changed.
+    workdir : Path
+        An empty or missing folder, removed at the end.
+    seed : int
+    refine_principal_point : bool
+    num_threads : int
+        With 1 equal arguments give equal models.
+
+    Returns
+    -------
+    pycolmap.Reconstruction or None
+        With all photos that could be registered; None if fewer than two would be left to start from, or
+        mapping lost photos that were not to be taken out.
+
+    Raises
+    ------
+    DatabaseError
+        If the database cannot be read.
+    """
+    rest = pycolmap.Reconstruction(model)
+    for image in list(rest.images.values()):
+        if image.has_pose and image.name in names:
+            rest.deregister_frame(image.frame_id)
+    if rest.num_reg_images() < 2:
+        return None
+    given, found = workdir / "given", workdir / "found"
+    for folder in (given, found):
+        folder.mkdir(parents=True)
+    rest.write_binary(given)
+    candidate = Candidate(mapper=MapperKind.RELAXED, seed=seed)
+    options = incremental_options(candidate, refine_principal_point, num_threads)
+    with colmap_log(), database_errors(database):
+        pycolmap.set_random_seed(seed)
+        models = pycolmap.incremental_mapping(database, workdir, found, options, input_path=given)
+    shutil.rmtree(workdir)
+    again = max(models.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
+    kept = {image.name for image in rest.images.values() if image.has_pose}
+    if again is None or not kept <= {image.name for image in again.images.values() if image.has_pose}:
+        return None
+    return again

@@ -1,0 +1,217 @@
+"""The model of a scene: mapped, judged, and chosen among candidates where the first one does not convince."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.reconstruction.calibration import describe_impossible, has_prior_focal_lengths
+from corrsfm.reconstruction.candidates import Candidate, candidate_bank
+from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
+from corrsfm.reconstruction.explained import Explained, explain
+from corrsfm.reconstruction.pool import CandidatePool
+from corrsfm.reconstruction.predicted import NeighbourTables, predict, sample_pairs
+from corrsfm.reconstruction.registration import register_again
+from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
+from corrsfm.reconstruction.views import Views, views_of
+from corrsfm.types import Features, Pair
+
+__all__ = ["SceneEvidence", "Selection", "policy_for", "select_model"]
+
+FIRST = "first"
+_MENDED = "+mended"
+# A small scene may try many models in seconds; a large one must not take 25 times as long.
+_MOST_TIMES, _TIMES, _SECONDS = 25.0, 2.0, 120.0
+
+
+class SceneEvidence:
+    """What models of one scene are judged by: its verified matches and its features.
+
+    Parameters
+    ----------
+    names : sequence of str
+        All photos of the scene.
+    verified : mapping of Pair to (K, 2) int
+        Verified matches.
+    load : callable
+        Photo name → `Features`.
+    seed : int
+        Of the sample of pairs over which predicted matches of large scenes are counted.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        verified: Mapping[Pair, NDArray[np.int32]],
+        load: Callable[[str], Features],
+        *,
+        seed: int = 0,
+    ) -> None:
+        self.names = sorted(names)
+        self.verified = verified
+        self._load = load
+        self._seed = seed
+        self._tables = NeighbourTables(lambda name: load(name).descriptors)
+
+    @cached_property
+    def keypoints(self) -> dict[str, NDArray[np.float32]]:
+        """Keypoints of every photo that is in a verified pair."""
+        paired = sorted({name for pair in self.verified for name in pair})
+        return {name: self._load(name).keypoints for name in paired}
+
+    @cached_property
+    def _pairs(self) -> list[Pair]:
+        return sample_pairs(self.keypoints, self.verified, seed=self._seed)
+
+    def explain(self, views: Views) -> Explained:
+        """What a model explains of the verified matches."""
+        return explain(views, self.keypoints, self.verified)
+
+    def count_predicted(self, views: Views) -> int:
+        """Matches that a model predicts; the neighbours of features are computed when first needed."""
+        predicted = predict(views, self.keypoints, self._tables, self._pairs)
+        return sum(len(matches) for matches in predicted.values())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Selection:
+    """The model that was selected, and why.
+
+    Attributes
+    ----------
+    model : pycolmap.Reconstruction
+    choice : Choice
+    verdict : Verdict
+    """
+
+    model: pycolmap.Reconstruction
+    choice: Choice
+    verdict: Verdict
+
+
+def policy_for(max_models: int, first_seconds: float) -> ChoicePolicy:
+    """The policy within a budget: the time of two first mappings and two minutes, and of 25 at most."""
+    factor = min(_MOST_TIMES, _TIMES + _SECONDS / max(first_seconds, 1e-3))
+    return ChoicePolicy(max_models=max_models, max_time_factor=factor)
+
+
+def select_model(
+    first: pycolmap.Reconstruction | None,
+    evidence: SceneEvidence,
+    database: Path,
+    workdir: Path,
+    *,
+    policy: ChoicePolicy,
+    first_seconds: float,
+    seed: int = 0,
+    given_focal_lengths_px: Mapping[int, float] | None = None,
+    refine_principal_point: bool = False,
+    num_processes: int = 1,
+) -> Selection | None:
+    """Keep the first model if it convinces, else try candidates and take the one that predicts most matches.
+
+    Parameters
+    ----------
+    first : pycolmap.Reconstruction or None
+        The model that mapping gave; None if it gave none, and the first candidate that gives one stands in.
+    evidence : SceneEvidence
+    database : Path
+        That the first model was made from; not changed.
+    workdir : Path
+        Candidates are kept here while the choice goes on, and read again after an interruption; removed at
+        the end. Must be of this database and these options alone.
+    policy : ChoicePolicy
+    first_seconds : float
+        What mapping the first model took.
+    seed : int
+        Of the first model.
+    given_focal_lengths_px : mapping of int to float, optional
+        Focal lengths to try as well, by COLMAP's camera id; see `map_candidate`.
+    refine_principal_point : bool
+    num_processes : int
+        Candidates mapped at a time; the choice does not depend on it.
+
+    Returns
+    -------
+    Selection or None
+        None if nothing gave a model.
+
+    Raises
+    ------
+    DatabaseError
+        If the database cannot be read.
+    """
+    models: dict[str, pycolmap.Reconstruction] = {}
+
+    def tried(name: str, model: pycolmap.Reconstruction, seconds: float) -> Tried:
+        models[name] = model
+        views = views_of(model)
+        return Tried(name=name, views=views, explained=evidence.explain(views), seconds=seconds)
+
+    bank = candidate_bank(seed=seed, have_given=bool(given_focal_lengths_px))
+    with CandidatePool(
+        database,
+        workdir,
+        focal_lengths_px=given_focal_lengths_px,
+        refine_principal_point=refine_principal_point,
+        num_processes=num_processes,
+        max_runtime_seconds=round(policy.max_time_factor * first_seconds) + 1,
+    ) as pool:
+
+        def map_round(candidates: Sequence[Candidate]) -> list[Tried | None]:
+            outcomes = zip(candidates, pool.map(candidates), strict=True)
+            return [
+                None if model is None else tried(one.name, model, pool.seconds(one))
+                for one, model in outcomes
+            ]
+
+        def mend(model: Tried) -> Tried | None:
+            again = register_again(
+                models[model.name],
+                model.explained.misplaced,
+                database,
+                workdir / "again",
+                seed=seed,
+                refine_principal_point=refine_principal_point,
+            )
+            return None if again is None else tried(model.name + _MENDED, again, first_seconds)
+
+        start = None if first is None else tried(FIRST, first, first_seconds)
+        while start is None and bank and policy.max_models > 1:
+            candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
+            start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)
+        if start is None:
+            return None
+        choice = choose_model(
+            start,
+            bank,
+            num_photos=len(evidence.names),
+            map_round=map_round,
+            count_predicted=evidence.count_predicted,
+            policy=policy,
+            mend=mend,
+        )
+    shutil.rmtree(workdir, ignore_errors=True)
+    model = models[choice.chosen.name]
+    return Selection(model=model, choice=choice, verdict=_verdict(model, choice, len(evidence.names)))
+
+
+def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int) -> Verdict:
+    points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
+    return judge(
+        Evidence(
+            num_photos=num_photos,
+            explained=choice.chosen.explained,
+            support=choice.support,
+            implausible_intrinsics=describe_impossible(model),
+            has_prior_focal_lengths=has_prior_focal_lengths(model),
+            thickness=thickness(points),
+        )
+    )

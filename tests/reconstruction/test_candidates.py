@@ -1,0 +1,119 @@
+"""Candidates: one function from a description and a database to a model."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_database import synthesize
+
+from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.candidates import (
+    Candidate,
+    FocalLengths,
+    MapperKind,
+    candidate_bank,
+    map_candidate,
+)
+from corrsfm.reconstruction.views import views_of
+
+
+def spoil_focal_length(path: Path, factor: float) -> float:
+    """Change the focal length on record; the true one."""
+    with pycolmap.Database.open(path) as database:
+        (camera,) = database.read_all_cameras()
+        true = camera.mean_focal_length()
+        for index in camera.focal_length_idxs():
+            camera.params[index] *= factor
+        database.update_camera(camera)
+    return true
+
+
+def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
+    bank = candidate_bank(seed=5, have_given=True, num_seeds=2)
+    assert len(bank) == len({candidate.name for candidate in bank}) == 2 * 3 * 4 - 1
+    assert Candidate(mapper=MapperKind.INCREMENTAL, seed=5) not in bank
+    assert {candidate.seed for candidate in bank} == {5, 6}
+
+
+def test_a_bank_without_given_focal_lengths_asks_for_none() -> None:
+    bank = candidate_bank(seed=0, have_given=False)
+    assert not any(candidate.focal_lengths is FocalLengths.GIVEN for candidate in bank)
+    assert len(bank) == 3 * 2 * 4 - 1
+
+
+@pytest.mark.parametrize("mapper", list(MapperKind))
+def test_every_mapper_finds_the_true_model(tmp_path: Path, mapper: MapperKind) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    model = map_candidate(Candidate(mapper=mapper), tmp_path / "database.db", tmp_path / "candidate")
+    assert model is not None
+    common = agreement(views_of(truth), views_of(model))
+    assert (common.num_photos, common.share) == (8, 1.0)
+    assert sorted(path.name for path in (tmp_path / "candidate").iterdir()) == ["candidate.json", "model"]
+
+
+@pytest.mark.parametrize("focal_lengths", [FocalLengths.GIVEN, FocalLengths.CALIBRATED])
+def test_focal_lengths_are_given_to_the_candidate_and_not_to_the_database(
+    tmp_path: Path, focal_lengths: FocalLengths
+) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    true = spoil_focal_length(tmp_path / "database.db", 1.2)
+    candidate = Candidate(mapper=MapperKind.HELD, focal_lengths=focal_lengths)
+    model = map_candidate(
+        candidate, tmp_path / "database.db", tmp_path / "candidate", focal_lengths_px={1: true}
+    )
+    assert model is not None
+    assert agreement(views_of(truth), views_of(model)).share == 1.0
+    assert model.cameras[1].mean_focal_length() == pytest.approx(true, rel=0.02)
+    assert not model.cameras[1].has_prior_focal_length
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        (camera,) = database.read_all_cameras()
+    assert camera.mean_focal_length() == pytest.approx(1.2 * true)
+    assert not camera.has_prior_focal_length
+
+
+def test_equal_candidates_give_equal_models(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db")
+    for mapper in MapperKind:
+        candidate = Candidate(mapper=mapper, seed=3)
+        one, other = (
+            map_candidate(candidate, tmp_path / "database.db", tmp_path / f"{mapper}-{turn}") for turn in "ab"
+        )
+        assert one is not None and other is not None
+        for view, again in zip(views_of(one).values(), views_of(other).values(), strict=True):
+            np.testing.assert_array_equal(view.rotation, again.rotation)
+            np.testing.assert_array_equal(view.translation, again.translation)
+
+
+def test_a_finished_candidate_is_read_and_not_mapped_again(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db")
+    candidate = Candidate(mapper=MapperKind.INCREMENTAL)
+    first = map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate")
+    again = map_candidate(candidate, tmp_path / "no such database", tmp_path / "candidate")
+    assert first is not None and again is not None
+    assert list(views_of(first)) == list(views_of(again))
+    assert json.loads((tmp_path / "candidate/candidate.json").read_text())["seconds"] > 0
+
+
+def test_what_an_interrupted_run_left_is_replaced(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db")
+    (tmp_path / "candidate/model").mkdir(parents=True)
+    (tmp_path / "candidate/model/cameras.bin").write_bytes(b"half")
+    model = map_candidate(
+        Candidate(mapper=MapperKind.INCREMENTAL), tmp_path / "database.db", tmp_path / "candidate"
+    )
+    assert model is not None and model.num_reg_images() == 8
+
+
+@pytest.mark.parametrize("mapper", list(MapperKind))
+@pytest.mark.parametrize("focal_lengths", list(FocalLengths))
+def test_a_database_without_pairs_gives_no_model(
+    tmp_path: Path, mapper: MapperKind, focal_lengths: FocalLengths
+) -> None:
+    synthesize(tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        database.clear_two_view_geometries()
+    candidate = Candidate(mapper=mapper, focal_lengths=focal_lengths)
+    for _ in range(2):  # the second time it is read
+        assert map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate") is None

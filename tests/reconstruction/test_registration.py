@@ -1,0 +1,54 @@
+"""Photos taken out of a model and registered again."""
+
+from pathlib import Path
+
+import pycolmap
+from scene_of_points import bend
+from synthetic_database import synthesize
+
+from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.registration import register_again
+from corrsfm.reconstruction.views import views_of
+
+
+def misplace(model: pycolmap.Reconstruction, number: int) -> str:
+    """Turn a photo of a model by 40 degrees; its name."""
+    name, view = list(views_of(model).items())[number]
+    wrong = bend(view, 40.0)
+    (image,) = [image for image in model.images.values() if image.name == name]
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(wrong.rotation), wrong.translation)
+    model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
+    return name
+
+
+def test_a_misplaced_photo_finds_its_place(tmp_path: Path) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    wrong = pycolmap.Reconstruction(truth)
+    name = misplace(wrong, 3)
+    assert agreement(views_of(wrong), views_of(truth)).share < 1.0
+    again = register_again(wrong, [name], tmp_path / "database.db", tmp_path / "work")
+    assert again is not None
+    common = agreement(views_of(again), views_of(truth))
+    assert (common.num_photos, common.share) == (8, 1.0)
+    assert not (tmp_path / "work").exists()
+    assert wrong.num_reg_images() == 8
+
+
+def test_a_photo_without_pairs_stays_out(tmp_path: Path) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    image = truth.images[truth.reg_image_ids()[0]]
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        for pair_id in database.read_two_view_geometry_num_inliers()[0]:
+            pair = pycolmap.pair_id_to_image_pair(pair_id)
+            if image.image_id in pair:
+                database.delete_two_view_geometry(*pair)
+    again = register_again(truth, [image.name], tmp_path / "database.db", tmp_path / "work")
+    assert again is not None
+    assert sorted(views_of(again)) == sorted(set(views_of(truth)) - {image.name})
+
+
+def test_nothing_is_left_to_start_from(tmp_path: Path) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    names = list(views_of(truth))[1:]
+    assert register_again(truth, names, tmp_path / "database.db", tmp_path / "work") is None
+    assert not (tmp_path / "work").exists()
