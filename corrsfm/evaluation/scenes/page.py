@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.files import atomic_write_text
+from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
 from corrsfm.report.style import frame, section
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
