@@ -168,7 +168,7 @@ class RealPairs:
         per_cell = torch.bincount(cell[usable], minlength=5 * len(self.scene_names)).double()
         per_scene = torch.bincount(scene[usable], minlength=len(self.scene_names)).double()
         levels = (per_cell.view(-1, 5) > 0).sum(1).clamp(min=1)
-        # Half of the draws follow the levels, half the pairs as they come.
+        # Half of the draws follow the levels, the other half all pairs alike.
         share = 0.5 / (per_cell[cell] * levels[scene]).clamp(min=1) + 0.5 / per_scene[scene].clamp(min=1)
         return torch.where(usable, share * per_scene[scene] ** scene_power, 0.0)
 

@@ -154,7 +154,7 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
     Raises
     ------
     InputError
-        If the folder holds no model or no overlapping pair.
+        If the folder holds no model, or no photos overlap.
     """
     folder = Path(folder)
     model = _read_model(folder)
