@@ -1,8 +1,8 @@
-"""Many scenes: every one a process of its own, on this machine or on an existing Dask cluster.
+"""Many scenes, each in its own process, on this machine or on an existing Dask cluster.
 
-A scene that fails does not stop the others, and running the batch again goes on where each scene stopped,
-because `corrsfm run` does. An interrupted batch ends the scenes that run on this machine; those that a Dask
-worker has begun go on to their end.
+A scene that fails does not stop the others. Running the batch again resumes each scene where it stopped, as
+`corrsfm run` does. An interrupted batch ends the scenes on this machine; those that a Dask worker has begun
+run to their end.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str,
     ----------
     collection : Path
     leave_out : Path, optional
-        A sub-folder that is no scene.
+        A sub-folder to skip.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def run_collection(
         Scenes at a time on this machine. They share its cores evenly, unless the arguments, or a pipeline
         file among them, say how many threads each may use.
     dask : str, optional
-        Address of a Dask scheduler whose workers see the same files; they run the scenes then.
+        Address of a Dask scheduler whose workers see the same files; its workers then run the scenes.
 
     Returns
     -------
@@ -116,13 +116,13 @@ def run_collection(
     Raises
     ------
     KeyboardInterrupt
-        On Ctrl-C or SIGTERM, after the scenes under way have been ended; the same call goes on from there.
+        On Ctrl-C or SIGTERM, after ending the scenes under way; the same call resumes them.
     """
     scenes = find_scenes(collection, leave_out=output)
     output.mkdir(parents=True, exist_ok=True)
     statuses: list[SceneStatus] = []
     processes = _Processes()
-    # A Dask worker cannot be sent the processes of this machine.
+    # Dask could not send the processes of this machine to a worker.
     work: Callable[..., SceneStatus] = run_one
     if dask is None:
         work = functools.partial(run_one, call=processes.call)
@@ -136,7 +136,7 @@ def run_collection(
             with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
                 pending = set(waiting)
                 while pending:
-                    # A wait without end can miss an interruption that comes just before it.
+                    # An unbounded wait can miss an interruption that comes just before it.
                     done, pending = wait(pending, POLL_SECONDS, FIRST_COMPLETED)
                     statuses.extend(future.result() for future in done)
                     bar.update(len(done))
@@ -149,7 +149,7 @@ def run_collection(
 
 
 def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
-    """What gives each of several scenes at a time its share of the cores, unless the user chose."""
+    """Arguments that give each concurrent scene its share of the cores, unless the user chose."""
     if jobs == 1 or any(argument.split("=")[0] == "--threads" for argument in arguments):
         return []
     for argument, following in itertools.pairwise([*arguments, ""]):
@@ -160,7 +160,7 @@ def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
 
 
 class _Processes:
-    """The processes of the scenes on this machine, to be ended together."""
+    """The processes of the scenes on this machine; `end` ends them together."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -168,7 +168,7 @@ class _Processes:
         self._ended = False
 
     def call(self, command: Sequence[str], **streams: Any) -> int:
-        """As `subprocess.call`; starts nothing any more once all have been ended."""
+        """Like `subprocess.call`, but starts nothing after `end`."""
         with self._lock:
             if self._ended:
                 return -signal.SIGTERM
@@ -181,7 +181,7 @@ class _Processes:
                 self._running.discard(process)
 
     def end(self) -> None:
-        """End all processes, those that do not listen by force."""
+        """Terminate all processes, and kill those that do not react."""
         with self._lock:
             self._ended = True
             running = list(self._running)
@@ -197,8 +197,8 @@ class _Processes:
 
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
-    """Make SIGTERM an interruption, which would end this process alone and leave its scenes running."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may
+    """Turn SIGTERM into an interruption; by default it ends this process and leaves its scenes running."""
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
         yield
         return
 
@@ -230,7 +230,7 @@ def run_one(
     *,
     call: Callable[..., int] = subprocess.call,
 ) -> SceneStatus:
-    """Run one scene in a process of its own; its output goes to `batch.log` beside its workspace."""
+    """Run one scene in its own process; its output goes to a log beside its workspace."""
     started = time.monotonic()
     log = Path(f"{workspace}.{LOG_NAME}")
     command = [sys.executable, "-m", "corrsfm", "--quiet", "run", images, workspace, *arguments]
@@ -246,7 +246,7 @@ def run_one(
 
 
 def _last_error(log: Path) -> str:
-    """The last error in a log with all its lines, or else its last line."""
+    """All lines of the last error in a log, or the last line if there is no error."""
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     starts = [number for number, line in enumerate(lines) if line.startswith("Error:")]
     return "\n".join(lines[starts[-1] if starts else -1 :])

@@ -16,7 +16,7 @@ from corrsfm.config import RunConfig
 __all__ = ["command_line", "evaluate"]
 
 FILTERS = (
-    "nn, mutual, ratioT, ratioT+mutual (T such as 0.8), oracle (the right matches), or a method of "
+    "nn, mutual, ratioT, ratioT+mutual (T such as 0.8), oracle (the inliers), or a method of "
     "`corrsfm prune` as METHOD[@sfm|@pose][:CHECKPOINT]"
 )
 ESTIMATORS = (

@@ -1,7 +1,7 @@
-"""Speed and memory of the network, as ratios to the plainly written published network in the same run.
+"""Speed and memory of the network, as ratios to the plainly written published network.
 
-Absolute times depend on the machine and on who else uses it; the ratios to a reference that is measured
-alternately with the shipped network do much less.
+Absolute times depend on the machine and its load. Reference and network take turns in the same run, so that
+their ratios depend on it much less.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class BenchmarkRow:
     pairs_per_second : float
         From the median time of the repetitions.
     peak_mib : float or None
-        Memory that a batch needs beyond weights and input, MiB; None where it cannot be measured.
+        Memory that a batch needs beyond weights and input, MiB; None if the system does not tell.
     speed_ratio : float
         Pairs per second over those of the reference.
     memory_ratio : float or None
@@ -76,7 +76,7 @@ def run_benchmark(
     Parameters
     ----------
     model : Path, optional
-        Checkpoint; the published architecture without training if not given, which is as fast as trained.
+        Checkpoint. If not given, the published architecture with fresh weights, which is as fast.
     devices : sequence of str
     sizes : sequence of int
         Matches a pair.
@@ -85,9 +85,9 @@ def run_benchmark(
     compile : bool
         Also measure the compiled network.
     repeats : int
-        Timed repetitions of each variant, after one that does not count.
+        Timed repetitions of each variant, after a warm-up.
     seed : int
-        Of the made-up matches.
+        Seed of the random matches.
 
     Returns
     -------
@@ -121,7 +121,7 @@ def _variants(
     compile: bool,
     device: torch.device,
 ) -> dict[str, Callable]:
-    """Functions of coordinates and side information to measure, by name; the reference first."""
+    """Variants by name, the reference first: functions of coordinates and side information."""
 
     def rounded(forward: Callable) -> Callable:
         def run(*inputs: torch.Tensor | None) -> object:
@@ -145,11 +145,11 @@ def _measure(
     repeats: int,
     device: torch.device,
 ) -> dict[str, tuple[float, float | None]]:
-    """Median seconds and peak bytes of each variant, all variants in turn so that a busy moment hits all."""
+    """Median seconds and peak bytes of each variant; they take turns, so that a busy moment hits all."""
     seconds: dict[str, list[float]] = {name: [] for name in variants}
     peaks: dict[str, float | None] = {}
     with torch.inference_mode():
-        for name, run in variants.items():  # warm up, and the only round in which memory is looked at
+        for name, run in variants.items():  # warm-up, and the only round that measures memory
             run(*inputs)
             with _PeakMemory(device) as peak:
                 run(*inputs)
@@ -170,7 +170,7 @@ def _synchronise(device: torch.device) -> None:
 
 
 class _PeakMemory:
-    """Most memory in use inside the block, beyond what was in use at its start."""
+    """Peak memory inside the block, beyond what was in use at its start."""
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
@@ -196,7 +196,7 @@ class _PeakMemory:
 
 
 def _reset_peak_rss() -> float | None:
-    """Forget the process's peak memory and return what it uses now; None where the system cannot."""
+    """Reset the process's peak memory and return its current use; None where the system cannot."""
     try:
         # Freed memory that the allocator still holds would hide what the next run needs.
         ctypes.CDLL(None).malloc_trim(0)
@@ -233,7 +233,7 @@ def _rows(
 
 
 def format_rows(rows: Sequence[BenchmarkRow]) -> str:
-    """A table for the terminal."""
+    """Rows as a table for the terminal."""
     columns = f"{'device':<8}{'matches':>8}{'batch':>7}  {'variant':<19}{'pairs/s':>9}{'×':>7}"
     lines = [columns + f"{'peak MiB':>10}{'×':>7}"]
     for row in rows:

@@ -2,7 +2,7 @@
 
 Two names that papers mix up are kept apart here. *AUC@t* is the exact area under the recall curve of the
 pose error up to t degrees. *mAP@t* is the older measure: the share of pairs below 5, 10, … t degrees,
-averaged. The second is about 1.8 times the first at five degrees; they cannot be compared.
+averaged. The second is about 1.8 times the first at five degrees: never compare one with the other.
 
 Everything is in percent unless the name says otherwise, and a pair without an estimate has error ``inf``.
 """
@@ -97,8 +97,8 @@ def pose_map(errors: ArrayLike, thresholds: Sequence[float] = POSE_THRESHOLDS_DE
 def precision_recall_f(predicted: ArrayLike, actual: ArrayLike) -> tuple[float, float, float]:
     """Precision, recall and F of one pair, in percent.
 
-    Means over pairs are taken of each of the three, so the mean F is not the F of the means. A measure
-    whose denominator is zero is zero.
+    Each is averaged over pairs, so the mean F is not the F of the means. A measure whose denominator is zero
+    is zero.
 
     Parameters
     ----------
@@ -149,8 +149,8 @@ def paired_bootstrap(
 ) -> Interval:
     """Interval of the mean difference ``values − baseline`` over the same pairs.
 
-    Resampling pairs, not methods, removes the spread that both share; a difference whose interval holds
-    zero is no finding.
+    Resampling pairs, not methods, removes the spread that both share. A difference whose interval contains
+    zero shows nothing.
     """
     values, baseline = np.asarray(values, np.float64), np.asarray(baseline, np.float64)
     if values.shape != baseline.shape:

@@ -76,7 +76,7 @@ def auc_intervals(
 
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:
-    """A number for JSON, which has no infinity: None for a failure."""
+    """Number for JSON, which has no infinity: None for a failure."""
     if not math.isfinite(value):
         return None
     return float(value) if digits is None else round(float(value), digits)
@@ -126,12 +126,12 @@ def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:
 def kept_methods(
     results: Path | None, kind: str, subject: dict[str, Any], *, overwrite: bool
 ) -> dict[str, Any]:
-    """Methods that a result file already holds for the same subject.
+    """Read the methods that a result file already holds for the same subject.
 
     Raises
     ------
     InputError
-        If the file is no result file, or was measured on something else and ``overwrite`` is not given.
+        If the file is not a result file, or was measured on something else and ``overwrite`` is not given.
     """
     if results is None or not results.exists():
         return {}

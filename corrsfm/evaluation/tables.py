@@ -75,7 +75,7 @@ def _pose_table(values: dict[str, Any]) -> Table:
     subject = values["subject"]
     caption = (
         f"{subject['num_pairs']} pairs of {len(set(subject['pair_scenes']))} scenes, on average "
-        f"{subject['num_matches']:.0f} putative matches, {subject['inlier_percent']:.1f} % of them right. "
+        f"{subject['num_matches']:.0f} putative matches, {subject['inlier_percent']:.1f} % of them inliers. "
         f"{_origin(values)}"
     )
     return Table(header=header, rows=rows, caption=caption)
@@ -178,7 +178,7 @@ def _bench_table(values: dict[str, Any]) -> Table:
 
 
 def _origin(values: dict[str, Any]) -> str:
-    """Where a table comes from: versions and seed, for a caption."""
+    """Origin of a table for its caption: versions and seed."""
     versions = values["provenance"]["versions"]
     libraries = ", ".join(
         f"{name} {versions[key]}"
@@ -216,11 +216,11 @@ def build_table(values: dict[str, Any]) -> Table:
 
 
 def render_table(values: dict[str, Any]) -> str:
-    """A result file's content as a Markdown table with its caption.
+    """Render the content of a result file as a Markdown table with its caption.
 
     Raises
     ------
     InputError
-        If there is no table for its kind.
+        If no table is known for its kind.
     """
     return build_table(values).markdown()

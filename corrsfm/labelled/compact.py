@@ -165,7 +165,7 @@ class CompactScene:
 
 
 def quantise_ratios(ratios: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Ratios as they are stored, in units of 1 / `RATIO_STEPS`."""
+    """Quantise ratios as they are stored, in units of 1 / `RATIO_STEPS`."""
     return np.round(np.clip(ratios, 0, 1) * RATIO_STEPS).astype(np.uint8)
 
 
@@ -258,7 +258,7 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
 
 
 def is_compact(path: Path) -> bool:
-    """Whether a file is a compact pair file of any version, rather than one in another HDF5 layout."""
+    """Whether a file is a compact pair file, of any version, rather than of another HDF5 layout."""
     with open_pairs(path) as file:
         return bool(file.attrs.get("format") == _FORMAT)
 
@@ -282,13 +282,13 @@ def read_scenes(path: Path) -> list[CompactScene]:
 def read_labelled_pairs(
     path: Path, *, num_per_scene: int | None = None, seed: int = 0
 ) -> Iterator[OANetPair]:
-    """Pairs of a compact file in the record of the OANet layout.
+    """Read the pairs of a compact file one by one.
 
     Parameters
     ----------
     path : Path
     num_per_scene : int, optional
-        Draw at most so many pairs of each scene at random; all if not given.
+        Random pairs to draw from each scene; all if not given.
     seed : int
         Seed of the draw.
     """

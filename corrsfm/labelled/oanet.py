@@ -8,9 +8,9 @@ The layout has one group per quantity with one dataset per pair, named by a runn
     ratios (N,), mutuals (N,)
 
 Principal points there count from the centre of the first pixel, ours from its corner; this module converts.
-``f`` is one focal length or two (x, y). Files written here carry four groups more, which other readers do
-not look at and which are optional here: ``log_scale_ratios``, ``rotations`` (N,), ``sizes`` (2, 2) and the
-string ``scenes``.
+``f`` is one focal length or two (x, y). Files written here have four more groups, which other readers ignore
+and this one does not need: ``log_scale_ratios``, ``rotations`` (N,), ``sizes`` (2, 2) and the string
+``scenes``.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class OANetPair:
     rotations : (N,) float32
         Keypoint orientation in image 1 minus image 0, radians; zeros if unknown.
     camera0, camera1 : Camera
-        Cameras of any model; their focal lengths and principal point made the normalised coordinates, their
-        distortion, if they have one, is still in them.
+        Cameras of any model. Their focal lengths and principal points normalise the coordinates; their
+        distortion, if any, is still in them.
     scene : str
         Name of the place, "" if unknown.
     name : str
@@ -110,7 +110,7 @@ class OANetPair:
         return self.label_distances < threshold
 
     def as_correspondences(self) -> Correspondences:
-        """The same matches as prune methods take them, without the truth."""
+        """The same matches in the record that prune methods take, without the truth."""
         points = [
             _to_pixels(camera, self.correspondences[:, columns])
             for camera, columns in ((self.camera0, slice(0, 2)), (self.camera1, slice(2, 4)))
@@ -141,7 +141,7 @@ def open_pairs(path: Path) -> Iterator[h5py.File]:
     Raises
     ------
     InputError
-        If it cannot be opened, or not be read inside the block.
+        If it cannot be opened, or read inside the block.
     """
     try:
         with h5py.File(path, "r") as handle:
@@ -171,8 +171,8 @@ def _camera(handle: h5py.File, index: str, image: int) -> Camera:
     if "sizes" in handle and index in handle["sizes"]:
         width, height = (int(side) for side in handle["sizes"][index][image])
     else:
-        # The size is not in the published layout; a centred principal point gives it, and nothing
-        # that is computed from a pinhole camera depends on it.
+        # The published layout has no size. A centred principal point gives it, and nothing that is
+        # computed from a pinhole camera depends on it.
         width, height = (max(1, round(2.0 * c + 1.0)) for c in centre)
     return Camera(
         model="PINHOLE",
@@ -224,9 +224,9 @@ def read_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -
     path : Path
         File in OANet's layout.
     max_per_scene : int, optional
-        Read only so many random pairs of each scene; a file without scene names is one scene.
+        Random pairs to read of each scene; all if not given. A file without scene names is one scene.
     seed : int
-        Of that choice.
+        Seed of that choice.
 
     Raises
     ------
@@ -243,9 +243,9 @@ def read_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -
 
 
 def select_per_scene(scenes: list[str], max_per_scene: int, seed: int) -> list[int]:
-    """Indices of at most so many random entries of each scene, increasing.
+    """Choose at most ``max_per_scene`` random entries of each scene; returns their indices, increasing.
 
-    A scene's choice depends on its own entries and the seed only, not on the other scenes.
+    The choice for a scene depends only on its entries and the seed.
     """
     chosen: list[int] = []
     for scene in sorted(set(scenes)):

@@ -1,4 +1,15 @@
-"""Networks, tensors in and out: `network` is CorrAdaptor, `rivals` are others, `weights` reads files."""
+"""Networks, tensors in and out.
+
+::
+
+    model/
+    ├── network.py      CorrAdaptor, read from its layers to the whole
+    ├── plain.py        the published network written down plainly, to test and time against
+    ├── weights.py      checkpoints: load, save, verify
+    ├── published.py    names of the published checkpoints in ours
+    ├── rivals/         other networks of the literature, over shared layers
+    └── checkpoints/    bundled weights with their model cards
+"""
 
 from corrsfm.model.network import CorrAdaptor, NetworkConfig, PruningOutput
 from corrsfm.model.weights import load_network, read_provenance, save_network

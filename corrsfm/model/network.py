@@ -413,7 +413,7 @@ class Attention(nn.Module):
         context : Tensor, shape (R B, N, C) or (B, N, C)
             Layer-normalised without affine; with B items the branches share it and its keys.
         query_norm, context_norm : LayerNorm
-            Whose affine parts are still to be applied; they are folded into the projections.
+            Their affine parts have not been applied yet; they are folded into the projections.
         mask : Tensor, shape (R B, N) bool, optional
         """
         query = (self.query.weight, self.query.bias) if query_norm is None else fold(query_norm, self.query)
@@ -702,7 +702,7 @@ class WeightHead(nn.Module):
 
 
 class PruningOutput(NamedTuple):
-    """What the network says about a batch of pairs.
+    """Output of the network for a batch of pairs.
 
     With R fusion rounds there are 2 R + 1 sets of logits: R on all correspondences, R on those kept by the
     first pruning block, one on those kept by the second; five in the published configuration. Padding has the
@@ -894,7 +894,7 @@ class CorrAdaptor(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         """Finite inputs with enough rows for the neighbour search, and the mask of what is real among them.
 
-        A pair always has at least one row that counts, at worst a zero: no mean is taken over nothing.
+        A pair always has at least one row that counts, at worst a zero, so that no mean runs over nothing.
         """
         batch, num_rows, _ = correspondences.shape
         side = correspondences.new_zeros(batch, num_rows, 0) if side_information is None else side_information

@@ -1,9 +1,9 @@
-"""The published network written down plainly: what `network` is tested and timed against.
+"""The published network written down plainly, to test and time `network` against.
 
-Nothing here is optimised: features lie channels-first, (B,C,N,1) or (B,C,N,k), every layer is a convolution,
-every normalisation a pass of its own, both branches go through the motion injection one after the other, and
-the modules carry the names of the published checkpoint. Only the published structure is here, at any width;
-there is no padding, and pairs need enough correspondences for the neighbour search.
+Nothing is optimised: features lie channels-first, (B,C,N,1) or (B,C,N,k), every layer is a convolution, every
+normalisation its own pass, and the branches go through the motion injection one after the other. Modules have
+the names of the published checkpoint. The structure is the published one, at any width; there is no padding,
+and pairs need enough correspondences for the neighbour search.
 """
 
 from __future__ import annotations

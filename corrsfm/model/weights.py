@@ -61,7 +61,7 @@ CHECKPOINT_DIR = Path(__file__).parent / "checkpoints"
 
 @dataclass(frozen=True, kw_only=True)
 class BundledCheckpoint:
-    """What is known about a checkpoint that comes with the package; its model card says more."""
+    """A checkpoint that comes with the package; its model card says more."""
 
     name: str
     """How users refer to it."""
@@ -105,7 +105,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
 """Bundled checkpoints by name."""
 
 DEFAULT_CHECKPOINT = "small-side"
-"""Name of the one that is loaded when none is asked for."""
+"""Name of the checkpoint that is loaded by default."""
 
 
 @overload
@@ -142,7 +142,7 @@ def load_network(
         Refuse any other network: ``corradaptor`` or one of `corrsfm.model.rivals.ARCHITECTURES`. Recognised
         from the tensors' names where it is not given.
     map_location : str or torch.device
-        Where its parameters are put.
+        Device of its parameters.
 
     Raises
     ------
@@ -243,7 +243,7 @@ def checkpoint_sha256(path: Path | str | None = None) -> str:
     Raises
     ------
     CheckpointError
-        If there is no such checkpoint.
+        If the checkpoint does not exist.
     """
     file, released_sha256 = _locate(path)
     return released_sha256 or sha256_of(file)
@@ -274,8 +274,8 @@ def _read(file: Path, map_location: str | torch.device, *, expected_sha256: str 
             content = torch.load(file, map_location=map_location, weights_only=True)
     except OSError as error:
         raise CheckpointError(f"{file}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # what the reader stumbles over in a file that is none may be anything
-        # Never torch's own text: it advises to run whatever code the file holds.
+    except Exception as error:  # torch may raise anything on a file that is not a checkpoint
+        # Do not show torch's text: it suggests running the code that the file holds.
         forbidden = re.search(r"Unsupported global: GLOBAL (\S+)", str(error))
         reason = f"holds {forbidden[1]}" if forbidden else "is damaged, or another kind of file"
         raise CheckpointError(
@@ -323,7 +323,7 @@ def _read_config(values: Any, file: Path) -> NetworkConfig | RivalConfig:
 
 
 def _fill(network: nn.Module, state: Mapping[str, Any], complaint: str) -> None:
-    """Copy a state dict into a network of exactly its names and shapes."""
+    """Copy a state dict into a network; names and shapes must match exactly."""
     own = network.state_dict()
     problems = []
     for title, names in [("missing", own.keys() - state.keys()), ("unexpected", state.keys() - own.keys())]:

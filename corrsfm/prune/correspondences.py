@@ -83,10 +83,10 @@ def correspondences_from_points(
     mutual: ArrayLike | None = None,
     name: str = "",
 ) -> Correspondences:
-    """Putative matches of your own, of any detector, for a prune method.
+    """Putative matches of your own, from any detector, for a prune method.
 
-    What is not known of a match takes a neutral value: `UNKNOWN_RATIO`, mutual, no change of scale and no
-    rotation between the photos. The bundled network prunes less well for it.
+    What is unknown about a match takes a neutral value: `UNKNOWN_RATIO`, mutual, no change of scale and no
+    rotation between the photos. The bundled network prunes less well without it.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def correspondences_from_points(
 
 
 def _pinhole(matrix: ArrayLike, points: NDArray[np.float32]) -> Camera:
-    """A camera of known intrinsics; its size, which only messages show, is what holds the points."""
+    """A camera of known intrinsics, just large enough for the points; only messages show its size."""
     finite = points[np.isfinite(points).all(axis=1)]
     width, height = np.ceil(finite.max(axis=0, initial=1.0)).astype(int)
     return Camera.from_matrix(matrix, int(width), int(height))
@@ -214,7 +214,7 @@ def side_channels(matches: Any, num_channels: int, library: ModuleType) -> Any:
     Raises
     ------
     ValueError
-        If there is no layout of that many channels.
+        If no layout has that many channels.
     """
     if num_channels not in SIDE_LAYOUTS[1:]:
         raise ValueError(f"no layout of {num_channels} side channels, there are {list(SIDE_LAYOUTS)}")
@@ -239,7 +239,7 @@ def side_information(correspondences: Correspondences, num_channels: int) -> NDA
     Raises
     ------
     ValueError
-        If there is no layout of that many channels.
+        If no layout has that many channels.
     """
     if num_channels == 0:
         return np.zeros((len(correspondences), 0), np.float32)

@@ -1,4 +1,4 @@
-"""The state of a run: everything that a resumed run needs to continue as if it had never stopped."""
+"""State of a run: all that a resumed run needs to continue as if it had never stopped."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Average:
     ----------
     network : Module
     decay : float
-        Share of the past that a step keeps; early steps keep less, so that the start is soon forgotten.
+        Share of the average that a step keeps; early steps keep less, so that it soon forgets the start.
     """
 
     def __init__(self, network: nn.Module, decay: float) -> None:
@@ -34,7 +34,7 @@ class Average:
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
-        """Take in the weights after a step."""
+        """Add the weights after a step."""
         self._num_updates += 1
         decay = min(self._decay, (1 + self._num_updates) / (10 + self._num_updates))
         for name, value in network.state_dict().items():
@@ -44,15 +44,15 @@ class Average:
                 self._values[name].copy_(value)
 
     def copy_to(self, network: nn.Module) -> None:
-        """Give a network the averaged weights."""
+        """Copy the averaged weights into a network."""
         network.load_state_dict(self._values)
 
     def state_dict(self) -> dict[str, Any]:
-        """Values and number of updates."""
+        """Averaged values and number of updates."""
         return {"num_updates": self._num_updates, "values": self._values}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
+        """Restore what `state_dict` returned."""
         self._num_updates = state["num_updates"]
         for name, value in state["values"].items():
             self._values[name].copy_(value)
@@ -70,7 +70,7 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
     Raises
     ------
     CheckpointError
-        If the file is missing or something else.
+        If the file is missing or holds something else.
     """
     try:
         state = torch.load(path, map_location=device, weights_only=True)

@@ -1,4 +1,4 @@
-"""Options of training: one frozen dataclass each, the only home of a default."""
+"""Options of training, a frozen dataclass for each command: the only home of a default."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class AugmentConfig:
         f"Use {DEFAULT_FOCAL_FACTOR} times the longest side as the focal length, as where nothing is known",
         minimum=0,
     )
-    thin_probability: float = option(0.3, "Drop up to 85 % of the right matches", minimum=0)
+    thin_probability: float = option(0.3, "Drop up to 85 % of the inliers", minimum=0)
 
 
 NO_AUGMENTATION = AugmentConfig(
@@ -93,9 +93,9 @@ class TrainConfig:
     synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0)
     batch_size: int = option(32, "Pairs in a batch, on each device", minimum=1)
     num_matches: int = option(2000, "Matches drawn from each pair", minimum=32)
-    max_steps: int = option(60_000, "Steps of the run, if it is not bounded by time", minimum=1)
+    max_steps: int = option(60_000, "Steps of a run that is not bounded by time", minimum=1)
     max_minutes: float = option(
-        0.0, "Time of the run; the schedule then follows the time and ends with it; 0 for none", minimum=0
+        0.0, "Time of the run, which then drives the schedule; 0 for no bound", minimum=0
     )
     learning_rate: float = option(1e-3, "Largest learning rate", minimum=0)
     schedule: Schedule = option(Schedule.ONE_CYCLE, "Course of the learning rate; both end at zero")
@@ -104,14 +104,14 @@ class TrainConfig:
     max_gradient_norm: float = option(1.0, "Gradients are scaled down to this length", minimum=0)
     ema_decay: float = option(0.999, "Decay of the moving average of the weights; 0 for none", minimum=0)
     threshold: float = option(
-        INLIER_THRESHOLD, "Largest squared symmetric epipolar distance of a right match", minimum=0
+        INLIER_THRESHOLD, "Largest squared symmetric epipolar distance of an inlier", minimum=0
     )
     essential_start: float = option(0.05, "Share of the run without the essential loss", minimum=0)
     essential_weight: float = option(0.5, "Weight of the essential loss", minimum=0)
     bfloat16: bool = option(False, "Compute in bfloat16 where that is safe")
     compile: bool = option(False, "Compile the network", affects_result=False)
     scene_power: float = option(
-        0.5, "Scenes are drawn in proportion to their number of pairs to this power", minimum=0
+        0.5, "A scene is drawn in proportion to its number of pairs to this power", minimum=0
     )
     validate_minutes: float = option(
         10.0, "Time between validations", unit="min", minimum=0, affects_result=False
@@ -131,8 +131,8 @@ class TrainConfig:
 class SyntheticConfig:
     """Synthetic pairs."""
 
-    min_inlier_ratio: float = option(0.03, "Smallest share of right matches", minimum=0)
-    max_inlier_ratio: float = option(0.9, "Largest share of right matches", minimum=0)
+    min_inlier_ratio: float = option(0.03, "Smallest share of inliers", minimum=0)
+    max_inlier_ratio: float = option(0.9, "Largest share of inliers", minimum=0)
     noise_px: float = option(0.5, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0)
 
 
@@ -152,7 +152,7 @@ def load_recipe(path: Path) -> TrainRecipe:
     Raises
     ------
     ConfigError
-        If the file is missing, not TOML, or holds a key or value that does not exist.
+        If the file is missing, not TOML, or holds an unknown key or a wrong value.
     """
     values = load_toml(path, "a training recipe")
     network = values.pop("network", {})

@@ -1,8 +1,8 @@
 """Real pairs → training batches, assembled on the training device.
 
 All pairs of a data set fit in the memory of any accelerator (a few bytes per match), so a batch is a handful
-of indexing operations on the device, without worker processes. What a batch holds depends only on the seed,
-the step and the rank: a resumed run sees the very batches that a straight run would have seen.
+of indexing operations on the device, without worker processes. A batch depends only on the seed, the step and
+the rank: a resumed run sees the same batches as a straight one.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from corrsfm.training.config import AugmentConfig
 
 __all__ = ["Batch", "RealPairs", "augment", "concatenate", "generator_for", "side_information"]
 
-# A pair with fewer right matches has no label worth learning from.
+# A pair with fewer inliers teaches nothing.
 _MIN_INLIERS = 20
 
 
@@ -38,11 +38,11 @@ class Batch:
     Attributes
     ----------
     correspondences : (B, N, 4) float32
-        ``x0 y0 x1 y1`` normalised as inference would.
+        ``x0 y0 x1 y1`` normalised as in inference.
     true_correspondences : (B, N, 4) float32
         The same without lens distortion; what the matrix explains.
     matrix : (B, 3, 3) float32
-        ``x1ᵀ F x0 = 0`` for right ``true_correspondences``; essential unless the intrinsics were jittered.
+        ``x1ᵀ F x0 = 0`` for inliers among ``true_correspondences``; essential unless intrinsics are jittered.
     ratios, mutual, log_scale_ratios, rotations : (B, N) float32
         Side information before it becomes channels.
     mask : (B, N) bool
@@ -71,7 +71,7 @@ class Batch:
 
 
 def concatenate(batches: Sequence[Batch]) -> Batch:
-    """One batch of several that have the same number of matches."""
+    """Join batches that have the same number of matches."""
     if len(batches) == 1:
         return batches[0]
     columns = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in _BATCH_FIELDS}
@@ -87,7 +87,7 @@ _BATCH_FIELDS = tuple(entry.name for entry in fields(Batch))
 
 
 def generator_for(seed: int, step: int, rank: int, device: torch.device, stream: int = 0) -> torch.Generator:
-    """The random generator of one step of one process; ``stream`` separates its uses."""
+    """Random generator of one step of one process; ``stream`` separates its uses."""
     words = np.random.SeedSequence([seed, step, rank, stream]).generate_state(2, np.uint32)
     return torch.Generator(device).manual_seed(int(words[0]) << 31 ^ int(words[1]))
 
@@ -152,25 +152,23 @@ class RealPairs:
             pairs = torch.arange(start, min(start + 64, self.num_pairs), device=self.device)
             width = int(self._arrays["num_matches"][pairs].max())
             batch = self._gather(pairs, torch.arange(width, device=self.device).expand(len(pairs), -1))
-            right = batch.inliers()
-            counts.append(right.sum(1))
-            ratios.append(right.sum(1) / batch.mask.sum(1).clamp(min=1))
+            inliers = batch.inliers()
+            counts.append(inliers.sum(1))
+            ratios.append(inliers.sum(1) / batch.mask.sum(1).clamp(min=1))
         return torch.cat(ratios), torch.cat(counts)
 
     def _pair_weights(self, num_inliers: Tensor, scene_power: float) -> Tensor:
         scene = self._arrays["scene"]
         usable = num_inliers >= _MIN_INLIERS
         if not usable.any():
-            raise InputError(
-                f"no pair has {_MIN_INLIERS} right matches; check the poses of the training scenes"
-            )
-        # Within a scene every fifth of the range of inlier ratios that occurs is drawn equally often.
+            raise InputError(f"no pair has {_MIN_INLIERS} inliers; check the poses of the training scenes")
+        # Within a scene, the fifths of the range of inlier ratios that occur are drawn equally often.
         level = (self.inlier_ratios.clamp(max=0.999) ** 0.5 * 5).long()
         cell = scene * 5 + level
         per_cell = torch.bincount(cell[usable], minlength=5 * len(self.scene_names)).double()
         per_scene = torch.bincount(scene[usable], minlength=len(self.scene_names)).double()
         levels = (per_cell.view(-1, 5) > 0).sum(1).clamp(min=1)
-        # Half of the draws follow the levels, half the pairs as they come.
+        # Half of the draws follow the levels, the other half all pairs alike.
         share = 0.5 / (per_cell[cell] * levels[scene]).clamp(min=1) + 0.5 / per_scene[scene].clamp(min=1)
         return torch.where(usable, share * per_scene[scene] ** scene_power, 0.0)
 
@@ -199,16 +197,16 @@ class RealPairs:
         pairs = torch.multinomial(self._weights, num_pairs, replacement=True, generator=generator)
         available = self._arrays["num_matches"][pairs]
         width = int(available.max())
-        # A random order of each pair's own matches, padding last; right matches may be thinned out by moving
-        # some of them to the end, which makes the pair as hard as a wider baseline would.
+        # A random order of each pair's matches, padding last. Thinning moves some inliers to the end, which
+        # makes the pair as hard as a wider baseline would.
         order = torch.rand(num_pairs, width, device=self.device, generator=generator)
         columns = torch.arange(width, device=self.device)
         if config.thin_probability > 0:
             batch = self._gather(pairs, columns.expand(num_pairs, -1))
-            right = batch.inliers()
+            inliers = batch.inliers()
             draw = torch.rand(num_pairs, 2, 1, device=self.device, generator=generator)
             keep = torch.where(draw[:, 0] < config.thin_probability, 0.15 + 0.85 * draw[:, 1], 1.0)
-            thinned = right & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)
+            thinned = inliers & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)
             order = order + thinned
         order = order.masked_fill(columns >= available[:, None], torch.inf)
         batch = self._gather(pairs, order.argsort(1)[:, :num_matches])
@@ -217,7 +215,7 @@ class RealPairs:
 
 
 def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str, np.ndarray]:
-    """Arrays of a pair in OANet's layout, which has its own keypoints: those of image 0, then of image 1."""
+    """Arrays of a pair in OANet's layout; its keypoints are those of image 0, then of image 1."""
     num = len(pair)
     zeros = np.zeros(num, np.float32)
     # YFCC100M has more keypoints than 32 bits can count.
@@ -283,19 +281,19 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
 
 
 def _guess_factor(scene: CompactScene, image: int) -> float:
-    """True focal length over the one that is assumed where nothing is known."""
+    """True focal length over the one assumed where nothing is known."""
     camera = scene.cameras[image]
     return pinhole_parameters(camera)[0] / (DEFAULT_FOCAL_FACTOR * max(camera.width, camera.height))
 
 
 def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch.Generator) -> Batch:
-    """Change what a pair of photos could as well have been, truth and side information included.
+    """Change pairs into others that photos could show, truth and side information included.
 
     Parameters
     ----------
     batch : Batch
     guess : (B, 2) tensor
-        True over assumed focal length of each image, used where the intrinsics are taken as unknown.
+        True over assumed focal length of each image, for pairs whose intrinsics count as unknown.
     config : AugmentConfig
     generator : torch.Generator
 

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder beside the weights: ``recipe.json``, the CSV logs, TensorBoard's files."""
+"""Recipe and logs of a run: ``recipe.json``, the CSV files, TensorBoard's files."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["Journal", "described_recipe", "hardware"]
 
 
 class Journal:
-    """The logs of a run.
+    """Writes the recipe and the logs of a run.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Journal:
 
 
 def described_recipe(recipe: TrainRecipe) -> dict[str, Any]:
-    """A recipe in plain values, with files by name only: their place is private."""
+    """Recipe in plain values. Files by name only: checkpoints are published, paths are private."""
     values = json.loads(json.dumps(to_dict(recipe), default=str))
     train = recipe.train
     values["train"]["train_files"] = [path.name for path in train.train_files]

@@ -1,10 +1,10 @@
-"""The training loop: draw a batch, step, average, and now and then log, validate and save.
+"""The training loop: draw a batch, step, average; log, validate and save from time to time.
 
-With ``torchrun`` every process trains on its own device on its own batches, gradients are averaged, and
-process 0 writes. A run bounded by time follows the clock: the share of the time that is used up drives the
-schedule, so that the learning rate reaches zero when the time does. A run folder holds ``recipe.json``
-(options, seed, versions), ``log.csv``, ``validation.csv``, ``state.pt`` (everything that resuming needs) and
-``latest.pt`` (averaged weights).
+With ``torchrun`` every process trains on its own device and its own batches, gradients are averaged, and
+process 0 writes. In a run bounded by time the share of the time used drives the schedule, so that the
+learning rate reaches zero when the time is up. A run folder holds ``recipe.json`` (options, seed, versions),
+``log.csv``, ``validation.csv``, ``state.pt`` (everything that resuming needs) and ``latest.pt`` (averaged
+weights).
 """
 
 from __future__ import annotations
@@ -81,12 +81,12 @@ def train(
 
 
 def network_config(recipe: TrainRecipe) -> NetworkConfig:
-    """The architecture that a recipe asks for.
+    """Read the architecture that a recipe asks for.
 
     Raises
     ------
     ConfigError
-        If it cannot be built, or pruning could not feed it.
+        If it cannot be built, or has side channels that pruning does not compute.
     """
     config = from_dict(NetworkConfig, recipe.network, "network")
     if config.side_channels not in SIDE_LAYOUTS:
@@ -97,7 +97,7 @@ def network_config(recipe: TrainRecipe) -> NetworkConfig:
 
 
 def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
-    """The network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
+    """Build the network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     assert network.config is not None
     if recipe.network and network.config != config:
         raise ConfigError(
-            f"network: is not that of the initial checkpoint {recipe.train.initial}, which is "
+            f"network: differs from that of the initial checkpoint {recipe.train.initial}, which is "
             f"{to_dict(network.config)}; leave the table out to continue with that network"
         )
     return network
@@ -138,7 +138,7 @@ def _process_group(device: torch.device) -> Iterator[tuple[int, torch.device]]:
 
 
 class Trainer:
-    """One run: network, optimiser, average and the place they are saved to.
+    """One run: network, optimiser, average, and the folder they are saved to.
 
     Parameters
     ----------
@@ -199,7 +199,7 @@ class Trainer:
             for name, value in losses.items():
                 sums[name] = sums.get(name, 0.0) + value
             num_steps += 1
-            # Steps may be slow: nobody should wait longer than a minute for a sign of life.
+            # Steps may be slow: log at least once a minute.
             if self.step % self.config.log_every == 0 or self.minutes - last["log"] >= 1.0:
                 self._log({name: value / num_steps for name, value in sums.items()}, progress)
                 sums, num_steps = {}, 0
@@ -216,7 +216,7 @@ class Trainer:
         return self.config.output / "latest.pt"
 
     def _agreed_progress(self) -> float:
-        """Progress, that of process 0 for all: clocks differ, and all must stop at the same step."""
+        """Progress of process 0: clocks differ, but all processes must stop at the same step."""
         if self._model is self.network or not torch.distributed.is_initialized():
             return self.progress
         shared = torch.tensor([self.progress], dtype=torch.float64, device=self.device)
@@ -224,7 +224,7 @@ class Trainer:
         return float(shared)
 
     def train_step(self, progress: float) -> dict[str, float]:
-        """One step; returns its losses, nothing if the step was skipped."""
+        """Take one step; returns its losses, or nothing if it was skipped."""
         config = self.config
         rate = config.learning_rate * learning_rate_factor(progress, config.warm_up, config.schedule)
         for group in self.optimiser.param_groups:
@@ -297,7 +297,7 @@ class Trainer:
         state = load_state(self.state_path, self.device)
         if state["network_config"] != json.dumps(to_dict(self.network.config)):
             raise ConfigError(
-                f"{self.state_path}: is of another network; use another --output or the same recipe"
+                f"{self.state_path}: belongs to another network; use another --output or the same recipe"
             )
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
@@ -306,7 +306,7 @@ class Trainer:
         self.step, self.minutes, self.num_skipped = state["step"], state["minutes"], state["num_skipped"]
 
     def validate(self) -> dict[str, Any] | None:
-        """Scores of the averaged weights on the validation pairs, appended to ``validation.csv``."""
+        """Score the averaged weights on the validation pairs, and append a row to ``validation.csv``."""
         if self.config.val_file is None:
             return None
         if self._validation is None:
@@ -360,7 +360,7 @@ class Trainer:
 
 
 def _parameter_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:
-    """Matrices decay, biases and scales do not."""
+    """Parameter groups of the optimiser: matrices decay, biases and scales do not."""
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     return [
         {"params": [parameter for parameter in trained if parameter.ndim > 1], "weight_decay": weight_decay},

@@ -14,7 +14,7 @@ from corrsfm.model.network import symmetric_epipolar_squared
 __all__ = ["classification_loss", "essential_loss", "virtual_points"]
 
 MARGIN = 0.1
-"""Distances of virtual points count up to here."""
+"""Largest distance at which a virtual point counts."""
 
 
 def classification_loss(
@@ -42,13 +42,13 @@ def classification_loss(
     """
     total = logits[0].new_zeros(())
     for step, (logit, distance) in enumerate(zip(logits, distances, strict=True)):
-        # Sorting out right from wrong happens in the labels' own precision, the rest in that of the logits.
+        # Labels are decided in the precision of the distances; the rest is computed in that of the logits.
         positive = (distance < threshold).to(logit.dtype)
         valid = torch.ones_like(positive) if mask is None else mask[step].to(logit.dtype)
         num_positive = (positive * valid).sum(1, keepdim=True).clamp(min=1)
         num_negative = ((1 - positive) * valid).sum(1, keepdim=True).clamp(min=1)
         positive_weight = (num_negative / num_positive).clamp(min=1)
-        # A right match at the threshold counts fully, one on the line 1/e: the temperature of the paper.
+        # An inlier at the threshold counts fully, one on its line 1/e: the temperature of the paper.
         certainty = torch.exp(-(distance - threshold).abs() / threshold).to(logit.dtype)
         scaled = torch.where(positive > 0, certainty, 1.0) * logit.masked_fill(valid == 0, 0.0)
         losses = F.binary_cross_entropy_with_logits(
@@ -72,7 +72,7 @@ def essential_loss(essential: Tensor, points: Tensor) -> Tensor:
 
 
 def virtual_points(matrix: Tensor, *, num_iterations: int = 10) -> Tensor:
-    """Noise-free correspondences: a 20 × 20 grid in both images, moved onto the geometry.
+    """Make noise-free correspondences: a 20 × 20 grid in both images, moved onto the geometry.
 
     Each grid point paired with itself is moved by the smallest total squared distance that fulfils the
     epipolar constraint. The optimum is found by iterating first-order corrections, after P. Lindstrom,

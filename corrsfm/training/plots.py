@@ -24,7 +24,7 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, 
         from matplotlib.figure import Figure
     except ImportError as error:
         raise DependencyError("matplotlib", "plots of training", "train") from error
-    # A figure of its own, not pyplot's: no window system, nothing global.
+    # Not pyplot's figure, which needs a window system and keeps global state.
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, np.atleast_1d(figure.subplots(rows, columns)).reshape(-1)
 
@@ -75,25 +75,25 @@ def plot_learning_curves(run_folder: Path, output: Path) -> None:
 
 
 def _measures(batches: Sequence[Batch]) -> dict[str, NDArray[np.float64]]:
-    """What real and synthetic pairs are compared by."""
+    """Measures that real and synthetic pairs are compared by."""
     found: dict[str, list[NDArray]] = {}
     for batch in batches:
-        distances, right = batch.distances(), batch.inliers()
-        wrong = ~right & batch.mask
+        distances, inliers = batch.distances(), batch.inliers()
+        outliers = ~inliers & batch.mask
         motion = (batch.correspondences[..., 2:] - batch.correspondences[..., :2]).norm(dim=-1)
-        share = right.sum(1) / batch.mask.sum(1)
+        share = inliers.sum(1) / batch.mask.sum(1)
         values = {
             "inlier ratio of a pair": share,
-            "motion of right matches (focal lengths)": motion[right],
-            "motion of wrong matches (focal lengths)": motion[wrong],
-            "distance of wrong matches to the line (log₁₀)": distances[wrong].clamp(min=1e-9).log10() / 2,
-            "distance of right matches to the line (log₁₀)": distances[right].clamp(min=1e-12).log10() / 2,
-            "ratio, right": batch.ratios[right],
-            "ratio, wrong": batch.ratios[wrong],
-            "mutual share, right": (batch.mutual * right).sum(1) / right.sum(1).clamp(min=1),
-            "mutual share, wrong": (batch.mutual * wrong).sum(1) / wrong.sum(1).clamp(min=1),
-            "log scale ratio, right": batch.log_scale_ratios[right],
-            "cos rotation, right": batch.rotations[right].cos(),
+            "motion of inliers (focal lengths)": motion[inliers],
+            "motion of outliers (focal lengths)": motion[outliers],
+            "distance of outliers to the line (log₁₀)": distances[outliers].clamp(min=1e-9).log10() / 2,
+            "distance of inliers to the line (log₁₀)": distances[inliers].clamp(min=1e-12).log10() / 2,
+            "ratio, inliers": batch.ratios[inliers],
+            "ratio, outliers": batch.ratios[outliers],
+            "mutual share, inliers": (batch.mutual * inliers).sum(1) / inliers.sum(1).clamp(min=1),
+            "mutual share, outliers": (batch.mutual * outliers).sum(1) / outliers.sum(1).clamp(min=1),
+            "log scale ratio, inliers": batch.log_scale_ratios[inliers],
+            "cos rotation, inliers": batch.rotations[inliers].cos(),
             "matches that share a point of image 1": _share_of_repeats(batch),
         }
         for name, value in values.items():
@@ -102,7 +102,7 @@ def _measures(batches: Sequence[Batch]) -> dict[str, NDArray[np.float64]]:
 
 
 def _share_of_repeats(batch: Batch) -> Any:
-    """Share (B,) of matches whose place in image 1 another match has too."""
+    """Share (B,) of matches that have their place in image 1 in common with another."""
     places = (batch.correspondences[..., 2:] * 1e5).round().long()
     keys = places[..., 0] * 1_000_003 + places[..., 1]
     ordered = keys.sort(1).values

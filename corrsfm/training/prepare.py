@@ -49,7 +49,7 @@ _MIN_KEYPOINTS = 20
 
 @dataclass(frozen=True)
 class _SceneModel:
-    """What a reconstruction says about the photos of a scene, sorted by name."""
+    """What a reconstruction knows about the photos of a scene, sorted by name."""
 
     names: tuple[str, ...]
     cameras: tuple[Camera, ...]
@@ -64,7 +64,7 @@ def read_splits(path: Path) -> dict[str, list[str]]:
     Raises
     ------
     InputError
-        If the file is no such list or a scene is named twice.
+        If the file is not such a list or names a scene twice.
     """
     try:
         splits = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -115,7 +115,7 @@ def scenes_of_split(folder: Path, splits: Path, split: str) -> list[Path]:
     Raises
     ------
     InputError
-        If there is no such split.
+        If the file has no such split.
     """
     names = read_splits(splits)
     if split not in names:
@@ -141,7 +141,7 @@ def prepare_oanet(output: Path, scenes: Iterable[Path], config: PrepareConfig) -
 def _prepared(
     scenes: Iterable[Path], config: PrepareConfig, done: list[tuple[str, int]]
 ) -> Iterator[CompactScene]:
-    """Scenes one by one, each noted in ``done``."""
+    """Prepare scenes one by one, and note each in ``done``."""
     for folder in scenes:
         scene = prepare_scene(folder, config)
         done.append((scene.name, len(scene.pairs)))
@@ -149,12 +149,12 @@ def _prepared(
 
 
 def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
-    """Features, matches and ground truth of one scene.
+    """Make features, matches and ground truth of one scene.
 
     Raises
     ------
     InputError
-        If the folder holds no model or no overlapping pair.
+        If the folder holds no model, or no photos overlap.
     """
     folder = Path(folder)
     model = _read_model(folder)
@@ -211,7 +211,7 @@ def _offsets(parts: list) -> NDArray[np.int64]:
 
 
 def _images_folder(folder: Path) -> Path:
-    """Where the photos of a scene are."""
+    """Folder with the photos of a scene."""
     if (folder / "images").is_dir():
         return folder / "images"
     try:
@@ -232,8 +232,8 @@ def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
 
 def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:
     """Undistorted minus pinhole normalised coordinates (N, 2)."""
-    # A model of strong distortion may have no ray for a corner of the photo; such a point keeps its pinhole
-    # ray, its label is then "far from the line", which is what inference would find too.
+    # A model of strong distortion may have no ray for a corner of the photo. Such a point keeps its pinhole
+    # ray; its label is then "far from the line", as it looks in inference too.
     corrections = normalise_points(camera, keypoints) - normalise_by_pinhole(camera, keypoints)
     return np.nan_to_num(corrections, nan=0.0, posinf=0.0, neginf=0.0).astype(np.float32)
 

@@ -1,9 +1,8 @@
-"""What side information looks like on real pairs, measured and drawn again.
+"""Distributions of side information: measured on real pairs, drawn from for synthetic ones.
 
-Right and wrong matches differ in their ratio, their mutual flag, and how well their change of scale and of
-orientation agrees with the rest of the pair, and all of these are harder to tell apart on a pair with few
-right matches. The tables here hold quantiles for each level of difficulty, so that synthetic matches can be
-given the same distribution.
+Inliers and outliers differ in their ratio, their mutual flag, and how well their change of scale and of
+orientation agrees with the rest of the pair. All of these differ less on a pair with few inliers. The tables
+here hold quantiles for each level of difficulty, which give synthetic matches the same distribution.
 """
 
 from __future__ import annotations
@@ -32,13 +31,13 @@ class SideStatistics:
     Attributes
     ----------
     mutual : (4, 2) tensor
-        Share of mutual matches by level and by wrong or right.
+        Share of mutual matches by level, and by outlier or inlier.
     ratio : (4, 2, 2, Q) tensor
-        Quantiles of the ratio by level, wrong or right, and not mutual or mutual.
+        Quantiles of the ratio by level, outlier or inlier, and not mutual or mutual.
     log_scale : (2, Q) tensor
-        Quantiles of the log scale ratio, for right matches less what the depths say (the pair's median).
+        Quantiles of the log scale ratio; of inliers less the pair's median, which the depths explain.
     rotation : (2, Q) tensor
-        Quantiles of the rotation in radians, for right matches less what the cameras say (the pair's median).
+        Quantiles of the rotation in radians; of inliers less the pair's median, which the cameras explain.
     """
 
     mutual: Tensor
@@ -47,21 +46,21 @@ class SideStatistics:
     rotation: Tensor
 
     def to(self, device: torch.device) -> SideStatistics:
-        """The same on a device."""
+        """Copy to a device."""
         return SideStatistics(
             *(table.to(device) for table in (self.mutual, self.ratio, self.log_scale, self.rotation))
         )
 
     def draw(
-        self, right: Tensor, log_scale: Tensor, rotation: Tensor, generator: torch.Generator
+        self, inlier: Tensor, log_scale: Tensor, rotation: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Side information for synthetic matches.
+        """Draw side information for synthetic matches.
 
         Parameters
         ----------
-        right : (B, N) bool tensor
+        inlier : (B, N) bool tensor
         log_scale, rotation : (B, N) tensor
-            What the geometry says about each match.
+            Expected from the geometry.
         generator : torch.Generator
 
         Returns
@@ -70,11 +69,11 @@ class SideStatistics:
         """
 
         def uniform() -> Tensor:
-            return torch.rand(right.shape, device=right.device, generator=generator)
+            return torch.rand(inlier.shape, device=inlier.device, generator=generator)
 
-        share = right.float().mean(1, keepdim=True)
-        level = torch.bucketize(share, torch.tensor(LEVELS, device=right.device)).expand_as(right)
-        kind = right.long()
+        share = inlier.float().mean(1, keepdim=True)
+        level = torch.bucketize(share, torch.tensor(LEVELS, device=inlier.device)).expand_as(inlier)
+        kind = inlier.long()
         mutual = uniform() < self.mutual[level, kind]
         ratios = _interpolate(self.ratio[level, kind, mutual.long()], uniform())
         log_scale_noise = _interpolate(self.log_scale[kind], uniform())
@@ -82,8 +81,8 @@ class SideStatistics:
         return (
             ratios,
             mutual.float(),
-            torch.where(right, log_scale + log_scale_noise, log_scale_noise),
-            torch.where(right, rotation + rotation_noise, rotation_noise),
+            torch.where(inlier, log_scale + log_scale_noise, log_scale_noise),
+            torch.where(inlier, rotation + rotation_noise, rotation_noise),
         )
 
 
@@ -99,24 +98,24 @@ def _interpolate(quantiles: Tensor, position: Tensor) -> Tensor:
 def measure(batches: Iterable[Batch]) -> SideStatistics:
     """Measure the distributions on real pairs, without augmentation.
 
-    Cells with hardly any match borrow from the same kind of match over all levels.
+    Cells with few matches borrow from the same kind of match over all levels.
     """
     columns: dict[str, list[Tensor]] = {}
     for batch in batches:
-        right = batch.inliers()
-        share = right.sum(1, keepdim=True) / batch.mask.sum(1, keepdim=True).clamp(min=1)
+        inlier = batch.inliers()
+        share = inlier.sum(1, keepdim=True) / batch.mask.sum(1, keepdim=True).clamp(min=1)
         rotation = torch.remainder(batch.rotations + torch.pi, 2 * torch.pi) - torch.pi
         typical_scale = (
-            batch.log_scale_ratios.masked_fill(~right, torch.nan).nanmedian(1, keepdim=True).values
+            batch.log_scale_ratios.masked_fill(~inlier, torch.nan).nanmedian(1, keepdim=True).values
         )
-        typical_rotation = rotation.masked_fill(~right, torch.nan).nanmedian(1, keepdim=True).values
+        typical_rotation = rotation.masked_fill(~inlier, torch.nan).nanmedian(1, keepdim=True).values
         values = {
-            "level": torch.bucketize(share, torch.tensor(LEVELS, device=share.device)).expand_as(right),
-            "right": right.long(),
+            "level": torch.bucketize(share, torch.tensor(LEVELS, device=share.device)).expand_as(inlier),
+            "inlier": inlier.long(),
             "mutual": (batch.mutual > 0).long(),
             "ratio": batch.ratios,
-            "log_scale": batch.log_scale_ratios - torch.where(right, typical_scale, 0.0),
-            "rotation": rotation - torch.where(right, typical_rotation, 0.0),
+            "log_scale": batch.log_scale_ratios - torch.where(inlier, typical_scale, 0.0),
+            "rotation": rotation - torch.where(inlier, typical_rotation, 0.0),
         }
         for name, value in values.items():
             columns.setdefault(name, []).append(value[batch.mask].cpu())
@@ -124,26 +123,26 @@ def measure(batches: Iterable[Batch]) -> SideStatistics:
     num_levels = len(LEVELS) + 1
     mutual, ratio = torch.zeros(num_levels, 2), torch.zeros(num_levels, 2, 2, NUM_QUANTILES)
     for level in range(num_levels):
-        for right_flag in (0, 1):
-            cell = (table["right"] == right_flag) & (table["level"] == level)
+        for inlier_flag in (0, 1):
+            cell = (table["inlier"] == inlier_flag) & (table["level"] == level)
             if int(cell.sum()) < _MIN_VALUES:
-                cell = table["right"] == right_flag
-            mutual[level, right_flag] = table["mutual"][cell].float().mean()
+                cell = table["inlier"] == inlier_flag
+            mutual[level, inlier_flag] = table["mutual"][cell].float().mean()
             for mutual_flag in (0, 1):
                 inner = cell & (table["mutual"] == mutual_flag)
                 if int(inner.sum()) < _MIN_VALUES:
-                    inner = (table["right"] == right_flag) & (table["mutual"] == mutual_flag)
-                ratio[level, right_flag, mutual_flag] = _quantiles(table["ratio"][inner])
+                    inner = (table["inlier"] == inlier_flag) & (table["mutual"] == mutual_flag)
+                ratio[level, inlier_flag, mutual_flag] = _quantiles(table["ratio"][inner])
     return SideStatistics(
         mutual=mutual,
         ratio=ratio,
-        log_scale=torch.stack([_quantiles(table["log_scale"][table["right"] == kind]) for kind in (0, 1)]),
-        rotation=torch.stack([_quantiles(table["rotation"][table["right"] == kind]) for kind in (0, 1)]),
+        log_scale=torch.stack([_quantiles(table["log_scale"][table["inlier"] == kind]) for kind in (0, 1)]),
+        rotation=torch.stack([_quantiles(table["rotation"][table["inlier"] == kind]) for kind in (0, 1)]),
     )
 
 
 def _quantiles(values: Tensor) -> Tensor:
-    """Evenly spaced quantiles (Q,), the extremes at 1 and 99 % so that no single stray value counts."""
+    """Evenly spaced quantiles (Q,); the extremes are at 1 and 99 %, so that a stray value does not count."""
     if len(values) == 0:
         return torch.zeros(NUM_QUANTILES)
     positions = torch.linspace(0.0, 1.0, NUM_QUANTILES).clamp(0.01, 0.99)

@@ -1,9 +1,8 @@
 """Synthetic pairs without limit: structured scenes, realistic motions, outliers like real ones, exact truth.
 
-Everything is drawn on the training device for a whole batch at once. A pair is made from image 0:
-keypoints, a depth for each from the scene's structure, a motion, the projections into image 1. Matches that
-are to be right get those, with keypoint noise in both images; all others get a place in image 1 that a
-matcher could have mistaken for theirs.
+A whole batch is drawn at once on the training device. A pair starts from image 0: keypoints, a depth for each
+from the scene's structure, a motion, the projections into image 1. Inliers get those, with keypoint noise in
+both images; outliers get a place in image 1 that a matcher could mistake for theirs.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ class SyntheticPairs:
     config : SyntheticConfig
     device : torch.device
     statistics : SideStatistics
-        What side information looks like.
+        Distribution of side information.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class SyntheticPairs:
 def draw_both(
     paths: Sequence[Path], num_batches: int, *, num_pairs: int = 32, num_matches: int = 1000, seed: int = 0
 ) -> tuple[list[Batch], list[Batch]]:
-    """Batches of real pairs, not augmented, and as many of synthetic ones, to compare them."""
+    """Draw batches of real pairs, not augmented, and as many of synthetic ones, to compare them."""
     device = torch.device("cpu")
     real = RealPairs.from_files(paths, device)
     synthetic = SyntheticPairs(SyntheticConfig(), device)
@@ -116,17 +115,17 @@ def make_pairs(
     low, high = config.min_inlier_ratio, config.max_inlier_ratio
     wanted = low * (high / low) ** draw.uniform()
     order = draw.uniform(num_matches).masked_fill(~visible, 2.0).argsort(1).argsort(1)
-    right = visible & (order < (wanted * num_matches).ceil()[:, None])
+    inlier = visible & (order < (wanted * num_matches).ceil()[:, None])
 
     noise = config.noise_px / 1000.0 * draw.uniform(1, 1, low=0.3, high=1.5)
     true_x1 = x1 + noise * draw.normal(num_matches, 2)
     noisy_x0 = x0 + noise * draw.normal(num_matches, 2)
-    wrong_x1 = _wrong_places(draw, x1, half)
-    noisy_x1 = torch.where(right[..., None], true_x1, wrong_x1)
+    outlier_x1 = _outlier_places(draw, x1, half)
+    noisy_x1 = torch.where(inlier[..., None], true_x1, outlier_x1)
     # A patch looks larger where the point is nearer, and turns with the camera's roll.
     log_scale = torch.log(depth / points1[..., 2].clamp(min=0.05)) + normal_slope * 0.1
     roll = torch.atan2(rotation[:, 1, 0] - rotation[:, 0, 1], rotation[:, 0, 0] + rotation[:, 1, 1])
-    side = statistics.draw(right, log_scale, roll[:, None].expand_as(log_scale), generator)
+    side = statistics.draw(inlier, log_scale, roll[:, None].expand_as(log_scale), generator)
     correspondences = torch.cat([noisy_x0, noisy_x1], -1)
     return Batch(
         correspondences=correspondences,
@@ -207,8 +206,8 @@ def _motions(draw: _Draw, distance: Tensor) -> tuple[Tensor, Tensor]:
     return rotation, translation
 
 
-def _wrong_places(draw: _Draw, x1: Tensor, half: Tensor) -> Tensor:
-    """Places (B, N, 2) in image 1 for matches that are wrong, mixed from four kinds of mistake."""
+def _outlier_places(draw: _Draw, x1: Tensor, half: Tensor) -> Tensor:
+    """Places (B, N, 2) in image 1 of outliers, mixed from four kinds of mistake."""
     num = x1.shape[1]
     uniform = draw.uniform(num, 2, low=-1.0, high=1.0) * half[:, None]
     centres = draw.uniform(8, 2, low=-0.9, high=0.9) * half[:, None]
@@ -222,7 +221,7 @@ def _wrong_places(draw: _Draw, x1: Tensor, half: Tensor) -> Tensor:
     few = draw.choice(max(num // 20, 1), num)[..., None].expand(-1, -1, 2)
     shared = uniform.gather(1, few)
     places = torch.stack([uniform, clustered, repeated, shared], 2)
-    # On real pairs a third of all matches shares its place with another one.
+    # On real pairs a third of all matches share their place with another.
     weights = draw.uniform(1, 4) ** 2 + torch.tensor([0.0, 0.0, 0.0, 0.7], device=x1.device)
     kind = torch.multinomial(weights[:, 0] + 1e-3, num, replacement=True, generator=draw.generator)  # (B, N)
     chosen = places.gather(2, kind[..., None, None].expand(-1, -1, 1, 2))[:, :, 0]

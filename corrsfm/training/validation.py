@@ -1,4 +1,4 @@
-"""How good a network is as a filter before a robust estimator, on pairs it was not trained on."""
+"""How well a network filters matches for a robust estimator, on pairs that it has not seen."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SEED = 0
 
 
 def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) -> NDArray[np.float32]:
-    """Probability (M,) that each match is right, by the last set of logits that judged it."""
+    """Probability (M,) that each match is an inlier, by its last logit."""
     side = side_information(pair.as_correspondences(), network.side_channels)
     with torch.inference_mode():
         output = network(
@@ -47,7 +47,7 @@ def pose_error_deg(pair: OANetPair, kept: NDArray[np.bool_]) -> float:
     ----------
     pair : OANetPair
     kept : (M,) bool
-        Matches that are handed to the estimator.
+        Matches that the estimator gets.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def pose_error_deg(pair: OANetPair, kept: NDArray[np.bool_]) -> float:
 
 
 class Validation:
-    """A fixed subset of validation pairs and the score of the classical filter on it.
+    """A fixed subset of validation pairs, and the score of the classical filter on it.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ class Validation:
     def run(
         self, network: CorrAdaptor, device: torch.device, threshold: float = POSE_MIN_SCORE
     ) -> dict[str, Any]:
-        """Scores of a network: pose AUC over all pairs and by scene, precision, recall."""
+        """Score a network: pose AUC over all pairs and by scene, precision, recall."""
         network.eval()
         scores = [match_scores(network, pair, device) for pair in self.pairs]
         return self.judge(scores, lambda score: score > threshold)
@@ -85,7 +85,7 @@ class Validation:
     def judge(
         self, scores: Sequence[NDArray[np.float32]], keep: Callable[[NDArray[np.float32]], NDArray]
     ) -> dict[str, Any]:
-        """Scores of a rule that turns match scores into kept matches."""
+        """Score a rule that turns match scores into kept matches."""
         errors, quality = [], []
         for pair, score in zip(self.pairs, scores, strict=True):
             kept = keep(score)

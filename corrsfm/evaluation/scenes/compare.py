@@ -8,7 +8,7 @@
     ├── compare.json     what was measured
     └── compare.html     the same, with the pairs that differ most drawn
 
-Shared files are hard links, so a method costs no space but its own, and each workspace is an ordinary one
+Shared files are hard links: a method takes space only for what it makes. Each workspace is an ordinary one
 that every command accepts. Finished work is kept.
 """
 
@@ -49,7 +49,7 @@ def method_folder(method: str) -> str:
 def share_matches(base: Workspace, target: Workspace) -> None:
     """Give a workspace the photos, features, pairs and matches of another without copying them.
 
-    Stages whose record did not change keep what was made from them.
+    What was made from a stage stays valid while the record of the stage is unchanged.
     """
     target.images_dir = base.images_dir
     files = ("images_txt", "images_json", "features", "pairs", "pair_origins", "matches")
@@ -61,7 +61,7 @@ def share_matches(base: Workspace, target: Workspace) -> None:
         try:
             os.link(source, link)
         except OSError:
-            # Some file systems know no hard links.
+            # Some file systems have no hard links.
             shutil.copy2(source, link)
     for stage in _SHARED_STAGES:
         record = base.require(stage)
@@ -92,9 +92,9 @@ def compare_methods(
     methods : sequence of str
         ``METHOD[@POINT][:CHECKPOINT]``, methods of `corrsfm prune`.
     config : PipelineConfig
-        Options of all stages; of pruning what a method's name does not say.
+        Options of all stages; a method's name overrides those of pruning.
     ground_truth : Path, optional
-        See `corrsfm.evaluation.scene.read_poses`.
+        See `corrsfm.evaluation.scenes.score.read_poses`.
     results : Path, optional
         Also write the result file here.
     overwrite : bool
@@ -110,14 +110,14 @@ def compare_methods(
     Raises
     ------
     CorrsfmError
-        What the stages raise, except that a method whose mapping fails is a result, not an error.
+        Whatever the stages raise; but a method whose mapping fails is a result, not an error.
     """
     from corrsfm.evaluation.scenes.page import write_page
 
     prune_configs = {method: parse_prune_method(method, config.prune) for method in methods}
     folders = [method_folder(method) for method in prune_configs]
     if not folders or len(set(folders)) < len(folders) or "base" in folders:
-        raise ConfigError(f"methods {', '.join(methods)}: at least one is needed, and they must differ")
+        raise ConfigError(f"methods {', '.join(methods)}: give at least one, and each only once")
     base = Workspace(output / "base", create=True)
     _prepare(base, images_dir, config, overwrite)
     workspaces = {}
@@ -152,7 +152,7 @@ def compare_methods(
 
 
 def _scene_name(images_dir: Path) -> str:
-    """The folder's name; of ``SCENE/images`` the scene's."""
+    """Name of the folder of photos, or of the scene for ``SCENE/images``."""
     folder = images_dir.resolve()
     return folder.parent.name if folder.name == "images" and folder.parent.name else folder.name
 
@@ -169,7 +169,7 @@ def _prepare(base: Workspace, images_dir: Path, config: PipelineConfig, overwrit
 def _reconstruct(
     base: Workspace, workspace: Workspace, prune: PruneConfig, config: PipelineConfig, overwrite: bool
 ) -> str | None:
-    """Everything from pruning on; the reason if mapping fails."""
+    """Run everything from pruning on; returns the reason if mapping fails, else None."""
     with workspace.lock():
         share_matches(base, workspace)
         pipeline.prune_matches(workspace, prune, config.run, overwrite=overwrite)
@@ -219,7 +219,7 @@ def _measure(workspace: Workspace, failure: str | None, ground_truth: Path | Non
 
 
 def _score(workspace: Workspace, ground_truth: Path, *, failed: bool) -> dict[str, Any]:
-    """Comparison with known cameras; without a model every photo is missing."""
+    """Score against known cameras; without a model every photo is missing."""
     score = (
         score_poses({}, read_poses(ground_truth)) if failed else evaluate_scene(workspace.root, ground_truth)
     )

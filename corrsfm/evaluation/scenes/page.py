@@ -1,4 +1,4 @@
-"""The page of a comparison: the table, and the pairs that the methods disagree about most, drawn."""
+"""The HTML page of a comparison: its table, and drawings of the pairs that methods differ most on."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.files import atomic_write_text
+from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
 from corrsfm.report.style import frame, section
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
@@ -47,7 +48,7 @@ _TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...
 
 
 def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: dict[str, Workspace]) -> None:
-    """Write the page, one file without links to others.
+    """Write the page as one file without links.
 
     Parameters
     ----------
@@ -57,7 +58,7 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
     base : Workspace
         With features and putative matches.
     workspaces : dict
-        Method to its workspace.
+        Workspaces by method.
     """
     subject, provenance = values["subject"], values["provenance"]
     versions = ", ".join(f"{name} {version}" for name, version in provenance["versions"].items())
@@ -104,7 +105,7 @@ def _table(methods: dict[str, Any]) -> str:
 
 
 def _best(numbers: Sequence[float | None], sense: int) -> float | None:
-    """The best number, None where none is better than another."""
+    """Best of the numbers; None if all are equal."""
     known = [number for number in numbers if number is not None]
     if sense == 0 or len(set(known)) < 2:
         return None
@@ -114,9 +115,7 @@ def _best(numbers: Sequence[float | None], sense: int) -> float | None:
 def _drawn_pairs(
     rows: Sequence[dict[str, Any]], base: Workspace, workspaces: dict[str, Workspace]
 ) -> list[str]:
-    """One section per pair with a picture per method."""
-    from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
-
+    """A section for each pair, with a picture for each method."""
     oriented = {frozenset(pair): pair for pair in read_pairs(base).pairs}
     features, putative = ItemStore(base.features, FEATURES), ItemStore(base.matches, MATCHES)
     photo = functools.lru_cache(maxsize=2 * _NUM_DRAWN_PAIRS)(

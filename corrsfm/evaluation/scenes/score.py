@@ -30,7 +30,7 @@ class SceneScore:
     num_photos : int
         Photos with known cameras.
     num_registered : int
-        Those of them that the reconstruction holds.
+        Those of them that are registered in the reconstruction.
     auc : dict of str to float
         Percent, by threshold in degrees: exact AUC of the relative pose over all pairs of photos with known
         cameras; a pair with an unregistered photo is a failure.
@@ -94,7 +94,7 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     Raises
     ------
     InputError
-        If there is neither, or a file is damaged.
+        If the folder holds neither, or a file is damaged.
     """
     from corrsfm.colmap.models import is_model, poses_of, read_model
 
@@ -120,12 +120,12 @@ def _read_camera(path: Path) -> Pose:
             "cam_from_world"
         ) from error
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
-        raise InputError(f"{path}: 'rotation' is no rotation matrix; expected cam_from_world, rows first")
+        raise InputError(f"{path}: 'rotation' is not a rotation matrix; expected cam_from_world, rows first")
     return rotation, translation
 
 
 def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneScore:
-    """Score camera poses against known ones; photos that only one of them has are handled as documented."""
+    """Score camera poses against known ones; `SceneScore` says how photos count that only one of them has."""
     names = [name for name in sorted(truth) if name in poses]
     errors = relative_pose_errors(poses, truth)
     centres = np.array([camera_centre(truth[name]) for name in sorted(truth)])
@@ -138,7 +138,7 @@ def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneSc
                 [camera_centre(poses[name]) for name in names], [camera_centre(truth[name]) for name in names]
             )
         except ValueError:
-            # Centres on one line leave the alignment open; the relative poses still tell.
+            # Centres on one line leave the alignment open; relative poses are judged all the same.
             distances = None
     mean = None if distances is None else float(distances.mean())
     return SceneScore(

@@ -1,7 +1,7 @@
 """Estimators of the relative pose from filtered matches, under one interface.
 
-All see the same rays: pixels through the full known camera, so that no library is judged by another's
-treatment of distortion. Thresholds are pixels of the original photos unless a docstring says otherwise.
+All of them get the same rays, pixels through the full known camera, so that it does not matter how a library
+treats distortion. Thresholds are pixels of the original photos unless a docstring says otherwise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _MAX_ITERATIONS = 10000
 # PoseLib's defaults: fewer would handicap it on unfiltered matches.
 _POSELIB_ITERATIONS = 100000
 _POSELIB_CONFIDENCE = 0.9999
-# OpenCV's default. Its old RANSAC solves every sample on one core for minutes if allowed more.
+# OpenCV's default. With more, its old RANSAC takes minutes for a pair.
 _LITERATURE_ITERATIONS = 1000
 
 
@@ -70,7 +70,7 @@ def pose_errors_deg(pose: PoseEstimate | None, pair: OANetPair) -> tuple[float, 
 
 
 PoseEstimator = Callable[[Correspondences, PruneResult, int], PoseEstimate | None]
-"""Takes the matches, what a filter says of them, and a seed; None if there is no pose."""
+"""Takes matches, the result of a filter and a seed; returns None if it finds no pose."""
 
 
 def _rays(correspondences: Correspondences) -> NDArray[np.float64]:
@@ -100,7 +100,7 @@ def _pose_from_essential(
     kept: NDArray[np.int64],
     num: int,
 ) -> PoseEstimate | None:
-    """The decomposition with most points in front of both cameras; E may be several stacked ones."""
+    """Pose with most points in front of both cameras; ``essential`` may be several stacked matrices."""
     import cv2
 
     if essential is None or len(essential) < 3 or not np.isfinite(essential).all() or mask.sum() == 0:
@@ -130,14 +130,14 @@ def _opencv(
     method: str,
     threshold_px: float | None,
 ) -> PoseEstimate | None:
-    """``cv2.findEssentialMat``. Its generators are seeded with a constant: the seed shuffles the matches."""
+    """``cv2.findEssentialMat``. OpenCV seeds itself with a constant, so the seed shuffles the matches."""
     import cv2
 
     kept = np.random.default_rng(seed).permutation(np.flatnonzero(result.inlier_mask))
     if len(kept) < 6:
         return None
     if method == "USAC_PROSAC":
-        # Progressive sampling takes the best first; the ratio orders what a saturated score does not.
+        # Progressive sampling takes the best first; the ratio breaks the ties of saturated scores.
         kept = kept[np.lexsort((correspondences.ratios[kept], -result.scores[kept]))]
     rays = _rays(correspondences)[kept]
     threshold = _LITERATURE_THRESHOLD
@@ -154,7 +154,7 @@ def _opencv(
             maxIters=_LITERATURE_ITERATIONS if method == "RANSAC" else _MAX_ITERATIONS,
         )
     except cv2.error:
-        # Some degenerate samples make USAC give up with an exception instead of an empty matrix.
+        # USAC raises on some degenerate samples instead of returning an empty matrix.
         return None
     if mask is None:
         return None
@@ -269,7 +269,7 @@ def weighted_eight_point(rays: NDArray[np.float64], weights: NDArray[np.float64]
     rays : (M, 4) float64
         Normalised ``x0 y0 x1 y1``, M ≥ 8.
     weights : (M,) float64
-        Not negative.
+        Non-negative.
 
     Returns
     -------
@@ -294,10 +294,10 @@ def weighted_eight_point(rays: NDArray[np.float64], weights: NDArray[np.float64]
 def _eight_point(
     correspondences: Correspondences, result: PruneResult, seed: int, *, threshold_px: float | None
 ) -> PoseEstimate | None:
-    """No RANSAC: the filter's own essential matrix, else the eight-point one weighted by its scores.
+    """The filter's own essential matrix, or the eight-point one weighted by its scores; no RANSAC.
 
-    The threshold has no meaning here; points in front of the cameras are counted among matches closer than
-    3e-5 (squared, normalised) as the paper does.
+    The threshold is ignored. Points in front of the cameras are counted among matches closer than 3e-5
+    (squared, normalised), as in the paper.
     """
     del seed, threshold_px
     rays = correspondences.normalised.astype(np.float64)
@@ -329,7 +329,7 @@ _PACKAGES = {"colmap": "pycolmap", "poselib": "poselib", "w8pt": "numpy"}
 
 
 def estimator_fingerprint(text: str) -> str:
-    """Changes whenever an estimator's results may: its budget, and the version of its library."""
+    """Text that changes whenever results may: name, budget, version of the library."""
     package = _PACKAGES.get(text.partition(":")[0], "opencv-python-headless")
     try:
         version = importlib.metadata.version(package)
@@ -343,12 +343,12 @@ _DEFAULT_PX = {"ransac": None, "w8pt": None}
 
 
 def parse_estimator(text: str) -> PoseEstimator:
-    """An estimator from ``NAME`` or ``NAME:PIXELS``; the default threshold is one pixel.
+    """Build an estimator from ``NAME`` or ``NAME:PIXELS``; the default threshold is one pixel.
 
     Raises
     ------
     ConfigError
-        If there is no such estimator or the threshold is no positive number.
+        If the estimator is unknown or the threshold is not a positive number.
     """
     name, _, threshold = text.partition(":")
     if name not in ESTIMATORS:

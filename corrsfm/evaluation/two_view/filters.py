@@ -1,6 +1,6 @@
-"""Filters of putative matches under one interface: what is kept before a pose is estimated.
+"""Filters of putative matches under one interface: they decide what an estimator sees.
 
-A filter is named by a short text, see `parse_filter`; a class that keeps the protocol plugs another one in.
+A short text names a filter, see `parse_filter`. To add one, write a class like `PairFilter`.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ class PairFilter(Protocol):
     Attributes
     ----------
     name : str
-        What `parse_filter` makes it from.
+        The text that `parse_filter` reads.
     fingerprint : str
-        Changes whenever results may: options and the hash of a checkpoint.
+        Options and the hash of a checkpoint; changes whenever results may.
     """
 
     @property
@@ -51,13 +51,13 @@ class PairFilter(Protocol):
     def fingerprint(self) -> str: ...
 
     def __call__(self, pairs: Sequence[OANetPair]) -> list[PruneResult]:
-        """One result per pair, in order; matches of a pair in order; pairs without matches included."""
+        """Filter pairs, empty ones included; pairs and matches keep their order."""
 
 
 def result_of_filter(
     name: str, keep: NDArray[np.bool_], confidence: NDArray[np.float32] | float = 1.0
 ) -> PruneResult:
-    """What a filter without scores of its own says: a confidence in what it keeps, none in the rest."""
+    """Result of a filter that has no scores: a confidence in what it keeps, none in the rest."""
     scores = np.where(keep, confidence, 0.0).astype(np.float32)
     return PruneResult(scores=scores, inlier_mask=keep, decided_by=name)
 
@@ -97,7 +97,7 @@ class SideFilter:
 
 @dataclass(frozen=True, kw_only=True)
 class OracleFilter:
-    """Keep exactly the right matches: what a perfect filter would leave, the ceiling of all others."""
+    """Keep exactly the inliers, as a perfect filter would: the ceiling of all others."""
 
     threshold: float = INLIER_THRESHOLD
     name: str = "oracle"
@@ -141,27 +141,27 @@ _PRUNER = re.compile(r"(?P<method>[a-z]+)(?:@(?P<point>[a-z]+))?(?::(?P<model>.+
 
 
 def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> PairFilter:
-    """A filter from its name.
+    """Build a filter from its name.
 
     Parameters
     ----------
     text : str
         ``nn`` (all matches), ``mutual``, ``ratio0.8``, ``ratio0.8+mutual`` (any ratio), ``gms``, ``adalam``,
-        ``oracle`` (the right matches), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
+        ``oracle`` (the inliers), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
     device, seed, threads
         For methods of `corrsfm prune`.
 
     Raises
     ------
     ConfigError
-        If the name means nothing.
+        If no filter has this name.
     DependencyError
-        If the library that brings the filter is not installed.
+        If the library of the filter is not installed.
     """
     if text == "oracle":
         return OracleFilter()
     if text in ("gms", "adalam"):
-        # Here, not above: their libraries are optional.
+        # Imported here because their libraries are optional.
         from corrsfm.evaluation.two_view.neighbourhood import AdalamFilter, GmsFilter
 
         return GmsFilter() if text == "gms" else AdalamFilter(seed=seed)
@@ -179,18 +179,18 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
 
 
 def parse_prune_method(text: str, base: PruneConfig) -> PruneConfig:
-    """Options of a method of `corrsfm prune` from ``METHOD[@POINT][:CHECKPOINT]``.
+    """Read the options of a method of `corrsfm prune` from ``METHOD[@POINT][:CHECKPOINT]``.
 
     Parameters
     ----------
     text : str
     base : PruneConfig
-        What the text does not say.
+        Options that the text leaves open.
 
     Raises
     ------
     ConfigError
-        If there is no such method or operating point.
+        If the method or operating point is unknown.
     """
     match = _PRUNER.fullmatch(text)
     methods, points = [str(m) for m in PruneMethod], [str(p) for p in OperatingPoint]

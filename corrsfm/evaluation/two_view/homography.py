@@ -36,7 +36,7 @@ CORNER_THRESHOLDS_PX = (3.0, 5.0, 10.0)
 REFERENCE_SIDE_PX = 480.0
 RANSAC_THRESHOLD_PX = 3.0
 _CONFIDENCE = 0.99999
-# A match within this many pixels of the true homography is right.
+# A match this close to the true homography is an inlier.
 _INLIER_PX = 3.0
 
 HOMOGRAPHY_FEATURES = FeaturesConfig(max_features=2000, root_sift=False)
@@ -58,10 +58,10 @@ class HomographyPair:
     name : str
         ``SEQUENCE 1-N``.
     matches : OANetPair
-        Nearest neighbours, normalised by the photo size as on uncalibrated photos; a label distance is 0 for
-        a right match and 1 for a wrong one, and the pose has no meaning.
+        Nearest neighbours, normalised by the photo size as on uncalibrated photos. A label distance is 0 for
+        an inlier and 1 for an outlier; the pose means nothing.
     homography : (3, 3) float64
-        The true one; pixels of image 0 to image 1, first pixel's centre at (0, 0).
+        True homography, from pixels of image 0 to image 1, first pixel's centre at (0, 0).
     size0, size1 : tuple of int
         Width and height in pixels.
     """
@@ -74,7 +74,7 @@ class HomographyPair:
 
 
 def list_sequences(folder: Path) -> list[Path]:
-    """Sequences of a folder in HPatches' layout, sorted, without those the literature leaves out.
+    """List the sequences of a folder in HPatches' layout, sorted, without those the literature leaves out.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def _read_homography(path: Path) -> NDArray[np.float64]:
 
 
 def _unit_camera(size: tuple[int, int]) -> Camera:
-    """The camera that maps a photo to [-1, 1]²: what learned filters get when intrinsics mean nothing."""
+    """Camera that maps a photo to [-1, 1]², as learned filters expect where intrinsics mean nothing."""
     width, height = size
     half = (width / 2.0, height / 2.0)
     return Camera(model="PINHOLE", width=width, height=height, params=(*half, *half))
@@ -225,7 +225,7 @@ def evaluate_homography(
     ----------
     folder : Path
     filters : sequence of str
-        See `corrsfm.evaluation.filters.parse_filter`.
+        See `corrsfm.evaluation.two_view.filters.parse_filter`.
     results : Path, optional
         Result file; filters that it already holds are not measured again.
     features : FeaturesConfig
@@ -236,7 +236,7 @@ def evaluate_homography(
     command : str
         Recorded in the result file.
     on_sequence : callable
-        Called with the name of each sequence and the number of sequences before it is worked on.
+        Called before each sequence with its name and the number of sequences.
 
     Returns
     -------

@@ -36,17 +36,17 @@ CLASSICAL_METHODS = (
     "ratio0.8+mutual/degensac",
     "oracle/poselib",
 )
-"""What a learned filter has to be compared with, and the ceiling; not ``gms``, which needs another OpenCV."""
+"""Classical rivals of a learned filter, and the ceiling; without ``gms``, which needs another OpenCV."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOutput:
-    """What a method says of one pair.
+    """Output of a method for one pair.
 
     Attributes
     ----------
     result : PruneResult
-        The filter's.
+        Of the filter.
     pose : PoseEstimate or None
     filter_seconds, estimator_seconds : float
     """
@@ -75,7 +75,7 @@ class TwoViewMethod:
 
     @property
     def fingerprint(self) -> str:
-        """Changes whenever results may."""
+        """Text that changes whenever results may."""
         estimator = estimator_fingerprint(self.name.rpartition("/")[2])
         return f"{self.filter.fingerprint} | {estimator}"
 
@@ -90,7 +90,7 @@ class TwoViewMethod:
         Returns
         -------
         list of MethodOutput
-            In the order of the pairs; the filter's time is shared out evenly.
+            In the order of the pairs; each has an equal share of the filter's time.
         """
         start = time.perf_counter()
         results = self.filter(pairs)
@@ -111,14 +111,14 @@ class TwoViewMethod:
 
 
 def parse_method(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> TwoViewMethod:
-    """A method from ``FILTER/ESTIMATOR``, such as ``ratio0.8+mutual/poselib`` or ``corradaptor@pose/w8pt``.
+    """Build a method from ``FILTER/ESTIMATOR``, such as ``ratio0.8+mutual/poselib``.
 
-    See `corrsfm.evaluation.filters.parse_filter` and `corrsfm.evaluation.estimators.parse_estimator`.
+    See `parse_filter` and `parse_estimator`.
 
     Raises
     ------
     ConfigError
-        If there is no such filter or estimator.
+        If the filter or estimator is unknown.
     """
     # The checkpoint of a filter may be a path with slashes; an estimator has none.
     filter_text, slash, estimator_text = text.rpartition("/")

@@ -27,7 +27,7 @@ __all__ = ["AdalamFilter", "GmsFilter"]
 
 # AdaLAM needs neighbours to fit local affine maps to; its code fails on a handful of matches.
 _FEWEST_MATCHES = 16
-# Both packages bring a module cv2; only one of them can be installed.
+# Both packages contain the module cv2, so only one can be installed.
 _OPENCV = "opencv-python-headless"
 
 
@@ -36,9 +36,9 @@ def _finite(pair: Correspondences) -> NDArray[np.intp]:
 
 
 class GmsFilter:
-    """Matches whose grid cell sends enough others to the same place, by OpenCV's contributed modules.
+    """Keeps matches whose grid cell sends enough others to the same place; OpenCV's contributed modules.
 
-    Rotation and change of scale are searched for, as wide baselines need.
+    Searches over rotations and changes of scale, as wide baselines need.
 
     Raises
     ------
@@ -64,7 +64,7 @@ class GmsFilter:
             return keep
         sizes = [(camera.width, camera.height) for camera in (pair.camera0, pair.camera1)]
         keypoints = [
-            # GMS looks grid cells up without a check, so that a point beyond the border would crash it.
+            # GMS does not check its grid indices: a point beyond the border would crash it.
             [cv2.KeyPoint(float(x), float(y), 1.0) for x, y in np.clip(points[rows], 0, np.array(size) - 1)]
             for points, size in zip((pair.points0, pair.points1), sizes, strict=True)
         ]
@@ -78,7 +78,7 @@ class GmsFilter:
 
 @dataclass(frozen=True, kw_only=True)
 class AdalamFilter:
-    """Matches that agree with an affine map of the region around a distinctive one, by kornia.
+    """Keeps matches that agree with an affine map of the region around a distinctive one; kornia.
 
     Raises
     ------
@@ -130,7 +130,7 @@ class AdalamFilter:
                 mnn=torch.from_numpy(pair.mutual[rows]),
                 im1shape=(pair.camera0.width, pair.camera0.height),
                 im2shape=(pair.camera1.width, pair.camera1.height),
-                # Only differences of angle and ratios of scale count, which are what is known.
+                # Only differences of angle and ratios of scale count, and those are known.
                 o1=torch.zeros(len(rows)),
                 o2=torch.rad2deg(tensor(pair.rotations)),
                 s1=torch.ones(len(rows)),

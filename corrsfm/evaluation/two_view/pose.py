@@ -1,4 +1,4 @@
-"""Two-view methods measured on labelled pairs: poses, and which matches they keep."""
+"""Two-view methods measured on labelled pairs: the matches they keep and the poses they find."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ _PER_PAIR = (
 
 
 def load_labelled_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -> list[OANetPair]:
-    """Pairs of a file in OANet's or in the compact layout.
+    """Read the pairs of a file in OANet's or in the compact layout.
 
     Raises
     ------
     InputError
-        If it is neither, or holds no pairs.
+        If the file is of neither layout, or holds no pairs.
     """
     if is_compact(path):
         pairs = list(read_labelled_pairs(path, num_per_scene=max_per_scene, seed=seed))
@@ -149,7 +149,7 @@ def score_pairs(
     on_progress : callable
         Called with the number of pairs just done.
     """
-    # Libraries load and compile on first use; that is not the method's time.
+    # Libraries load and compile on first use, which is not the method's time.
     method(pairs[:1], seed=seed)
     rows: list[dict[str, float]] = []
     for start in range(0, len(pairs), _BATCH):
@@ -168,7 +168,7 @@ def summarise(
     baseline: PairScores | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """Scores over all pairs and per scene, with bootstrap intervals.
+    """Summarise scores over all pairs and per scene, with bootstrap intervals.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def _from_json(values: dict[str, list[float | None]]) -> PairScores:
 
 @dataclass(frozen=True, kw_only=True)
 class _Subject:
-    """The pairs that methods are measured on, and how to name them again."""
+    """The pairs that methods are measured on, and a description that identifies them."""
 
     pairs: list[OANetPair]
     scenes: list[str] = field(default_factory=list)
@@ -272,16 +272,16 @@ def evaluate_pose(
     path : Path
         In OANet's or the compact layout.
     methods : sequence of str
-        See `corrsfm.evaluation.methods.parse_method`.
+        See `corrsfm.evaluation.two_view.methods.parse_method`.
     results : Path, optional
         Result file. Methods it already holds for the same pairs are kept, not measured again, and all of its
         methods take part in the comparison.
     baseline : str, optional
         Method that differences refer to; the first one if not given.
     max_per_scene : int, optional
-        Use so many random pairs of each scene.
+        Random pairs to use of each scene; all if not given.
     seed : int
-        Of the choice of pairs, of the estimators and of the resampling.
+        Seed of the choice of pairs, of the estimators and of the resampling.
     device, threads
         For learned methods.
     overwrite : bool
@@ -315,7 +315,7 @@ def evaluate_pose(
                 "pairs": _to_json(scores),
             }
             if results is not None:
-                # After every method, so that a long run may be stopped and taken up again.
+                # After every method, so that a long run can be stopped and resumed.
                 known = baseline if baseline in entries else None
                 _write(results, subject, entries, known, seed, command, device)
     return _write(results, subject, entries, baseline, seed, command, device)
@@ -330,7 +330,7 @@ def _write(
     command: str,
     device: str,
 ) -> dict[str, Any]:
-    """Summaries of all methods, written to the result file if there is one."""
+    """Summarise all methods, and write the result file if there is one."""
     baseline = baseline or next(iter(entries))
     if baseline not in entries:
         raise ConfigError(f"baseline '{baseline}' was not measured; add it as --method {baseline}")

@@ -115,7 +115,7 @@ def test_what_cannot_be_compared_is_explained(truth_dir: Path, tmp_path: Path):
     with pytest.raises(InputError, match="share no photo name"):
         evaluate_scene(truth_dir, tmp_path)
     (tmp_path / "b.jpg.json").write_text(json.dumps({**camera, "rotation": np.ones((3, 3)).tolist()}))
-    with pytest.raises(InputError, match=r"b\.jpg\.json: 'rotation' is no rotation matrix"):
+    with pytest.raises(InputError, match=r"b\.jpg\.json: 'rotation' is not a rotation matrix"):
         read_poses(tmp_path)
     (tmp_path / "b.jpg.json").write_text("{}")
     with pytest.raises(InputError, match=r"b\.jpg\.json: not a camera file"):
