@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,11 +16,13 @@ if TYPE_CHECKING:
 
 __all__ = [
     "camera_from_pycolmap",
+    "create_camera",
     "mean_focal_px",
     "normalise_by_pinhole",
     "normalise_points",
     "pinhole_parameters",
     "to_pycolmap",
+    "with_focal_length",
 ]
 
 
@@ -46,6 +49,24 @@ def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:
         params=tuple(float(value) for value in camera.params),
         has_prior_focal_length=bool(camera.has_prior_focal_length),
     )
+
+
+def create_camera(model: str, focal_px: float, width: int, height: int) -> Camera:
+    """A camera without distortion whose principal point is the centre of the photo.
+
+    Its focal length counts as a guess; `with_focal_length` makes it a known one.
+    """
+    import pycolmap
+
+    return camera_from_pycolmap(pycolmap.Camera.create_from_model_name(1, model, focal_px, width, height))
+
+
+def with_focal_length(camera: Camera, focal_px: float) -> Camera:
+    """The camera with another focal length, which counts as known; the rest stays."""
+    params = list(camera.params)
+    for index in to_pycolmap(camera).focal_length_idxs():
+        params[index] = float(focal_px)
+    return dataclasses.replace(camera, params=tuple(params), has_prior_focal_length=True)
 
 
 def mean_focal_px(camera0: Camera, camera1: Camera) -> float:

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
 
 from corrsfm import config as cfg
+from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.sqlite import is_truncated
 from corrsfm.config import config_hash
+from corrsfm.database.focal_evidence import PairPoints
+from corrsfm.database.focal_votes import VoteDecision, count_votes
+from corrsfm.database.shared_cameras import assign_by_votes, cameras_that_vote
 from corrsfm.database.write import write_database
+from corrsfm.files import atomic_write_json
 from corrsfm.machine import count_threads
+from corrsfm.types import Camera, Features, ImageRecord, Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, PRUNED
-from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.hloc import FEATURES, PRUNED, PrunedMatches
+from corrsfm.workspace.lists import Index, read_index, read_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish
 from corrsfm.workspace.store import ItemStore
 
 __all__ = ["verify_matches"]
 
 logger = logging.getLogger("corrsfm")
+
+VOTES_VERSION = "votes-1"
+# Voting picks 45 of these, spread over the photos.
+MAX_PAIRS_ASKED = 400
 
 
 def verify_matches(
@@ -29,8 +44,16 @@ def verify_matches(
     started = time.monotonic()
     index = read_index(workspace)
     pruned = workspace.require("pruned matches")
+    voting = _cameras_that_vote(workspace, index)
     fingerprint = config_hash(
-        "verified matches", pycolmap_version(), pruned.fingerprint, index.cameras, config, run.seed
+        "verified matches",
+        pycolmap_version(),
+        pruned.fingerprint,
+        index.cameras,
+        config,
+        run.seed,
+        # Where no camera votes, finished work of version 0.1.0 stays valid.
+        *([VOTES_VERSION] if voting else []),
     )
     pair_list = read_pairs(workspace)
     damaged = workspace.database.is_file() and is_truncated(workspace.database)
@@ -48,10 +71,16 @@ def verify_matches(
         ItemStore(workspace.features, FEATURES).reader() as read_features,
         ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
     ):
+        records, cameras, remarks = _decide_cameras(
+            workspace, index, voting, read_features, read_pruned, pair_list.pairs, run.seed
+        )
+        atomic_write_json(workspace.cameras_json, {"remarks": remarks})
+        for remark in remarks:
+            logger.info("%s", remark)
         write_database(
             workspace.database,
-            images=index.records,
-            cameras=index.cameras,
+            images=records,
+            cameras=cameras,
             features=read_features,
             kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
             config=config,
@@ -64,3 +93,64 @@ def verify_matches(
     )
     finish(workspace, outcome, fingerprint, config, inputs={"pruned matches": pruned.fingerprint})
     return outcome
+
+
+def _cameras_that_vote(workspace: Workspace, index: Index) -> list[tuple[int, ...]]:
+    """Groups of cameras, as indices, whose focal length the matches are asked for."""
+    if workspace.require("images").config["camera_mode"] == cfg.CameraMode.PER_IMAGE:
+        return []
+    return cameras_that_vote(index.cameras, index.records)
+
+
+def _decide_cameras(
+    workspace: Workspace,
+    index: Index,
+    voting: list[tuple[int, ...]],
+    read_features: Callable[[str], Features],
+    read_kept: Callable[[Pair], PrunedMatches],
+    pairs: Sequence[Pair],
+    seed: int,
+) -> tuple[list[ImageRecord], list[Camera], list[str]]:
+    """The photos with the cameras that the kept matches speak for, and a remark on each decision."""
+    # Sharing that the user asked for is not undone.
+    asked_for = workspace.require("images").config["camera_mode"] != cfg.CameraMode.AUTO
+    votes = {}
+    for ids in voting:
+        camera = index.cameras[ids[0]]
+        names = {record.name for record in index.records if record.camera_id in ids}
+        points = [
+            _centred_points(index, pair, read_features, read_kept(pair).indices)
+            for pair in _strongest(workspace, [pair for pair in pairs if names.issuperset(pair)])
+        ]
+        counted = count_votes(points, max(camera.width, camera.height), seed=seed, may_split=not asked_for)
+        if asked_for and counted.decision is VoteDecision.SCATTERED:
+            counted = dataclasses.replace(counted, decision=VoteDecision.UNDECIDED)
+        votes[ids] = counted
+    cameras, camera_ids, remarks = assign_by_votes(index.cameras, index.records, votes)
+    records = [
+        dataclasses.replace(record, camera_id=camera_id)
+        for record, camera_id in zip(index.records, camera_ids, strict=True)
+    ]
+    return records, cameras, remarks
+
+
+def _strongest(workspace: Workspace, pairs: list[Pair]) -> list[Pair]:
+    """The pairs with most kept matches, as many as voting can use."""
+    counts = {
+        pair: int(values["num_kept"])
+        for pair, values in ItemStore(workspace.pruned, PRUNED).attributes(pairs)
+    }
+    return sorted(sorted(pairs, key=lambda pair: (-counts[pair], pair))[:MAX_PAIRS_ASKED])
+
+
+def _centred_points(
+    index: Index, pair: Pair, read_features: Callable[[str], Features], matches: NDArray[np.int32]
+) -> PairPoints:
+    """Matched points of a pair in pixels from the principal points."""
+    record_of = {record.name: record for record in index.records}
+    sides = []
+    for side, name in enumerate(pair):
+        _, _, *centre = pinhole_parameters(index.camera_of(record_of[name]))
+        keypoints = read_features(name).keypoints[matches[:, side]].astype(np.float64)
+        sides.append(keypoints - np.array(centre))
+    return PairPoints(name0=pair[0], name1=pair[1], points0_px=sides[0], points1_px=sides[1])

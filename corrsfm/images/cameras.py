@@ -1,25 +1,27 @@
-"""Which photos share a camera, and what is known about each camera."""
+"""Which photos are proposed to share a camera, and what is known about each camera.
+
+Photos of one size without EXIF are proposed to share one, since one camera took most sets of photos. That is
+a proposal only: before verification, focal lengths that the matches vote for confirm it, split it or undo it
+(`corrsfm.database.focal_votes`).
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from corrsfm.camera import CAMERA_PARAMETERS, Camera
-from corrsfm.colmap.cameras import camera_from_pycolmap
+from corrsfm.colmap.cameras import create_camera, with_focal_length
 from corrsfm.config import CameraMode
 from corrsfm.errors import ConfigError, InputError, first_few
 
-if TYPE_CHECKING:
-    pass
-
-__all__ = ["PhotoInfo", "assign_cameras"]
+__all__ = ["DEFAULT_FOCAL_FACTOR", "PhotoInfo", "assign_cameras"]
 
 # COLMAP's guess where nothing is known: a field of view of about 45° along the longest side.
 DEFAULT_FOCAL_FACTOR = 1.2
@@ -55,7 +57,7 @@ class PhotoInfo:
 def assign_cameras(
     names: Sequence[str], infos: Sequence[PhotoInfo], *, mode: CameraMode, model: str, params: str = ""
 ) -> tuple[list[Camera], list[int]]:
-    """Decide which photos share a camera, and what is known about each camera.
+    """Propose which photos share a camera, and say what is known about each camera.
 
     Parameters
     ----------
@@ -63,8 +65,9 @@ def assign_cameras(
     infos : sequence of PhotoInfo
         One per name.
     mode : CameraMode
-        ``auto`` shares a camera among photos of equal size, EXIF camera and focal length. Photos without EXIF
-        get one each, as in COLMAP: equal size proves nothing, and a wrongly shared camera ruins a model.
+        ``auto`` shares a camera among photos of equal size, EXIF camera and focal length; photos without
+        EXIF count as equal in the latter two. COLMAP's cameras have one width and height, so portrait and
+        landscape photos of one camera get two; a log line says so, and both vote together.
         A camera that photos share by any other mode starts from the median of their known focal lengths; a
         warning names its photos if these differ by more than a few per cent.
     model : str
@@ -105,7 +108,7 @@ def assign_cameras(
         for group in groups.values():
             _warn_of_zoom([(names[index], infos[index].focal_px) for index in group])
         if mode is CameraMode.AUTO:
-            _suggest_sharing(infos)
+            _tell_of_proposals([infos[group[0]] for group in groups.values()], list(groups.values()))
     cameras = [_make_camera([infos[index] for index in group], model, values) for group in groups.values()]
     position = {key: index for index, key in enumerate(groups)}
     return cameras, [position[key] for key in keys]
@@ -118,29 +121,32 @@ def _camera_key(name: str, info: PhotoInfo, mode: CameraMode) -> tuple:
             return ()
         case CameraMode.PER_FOLDER:
             return (PurePosixPath(name).parent.as_posix(),)
-        case CameraMode.AUTO if _has_exif(info):
+        case CameraMode.AUTO:
             return (info.width, info.height, info.camera_name, info.focal_px)
     return (name,)
 
 
-def _has_exif(info: PhotoInfo) -> bool:
-    return info.camera_name is not None or info.focal_px is not None
-
-
-def _suggest_sharing(infos: Sequence[PhotoInfo]) -> None:
-    """Suggest sharing where photos of equal size get a camera each."""
-    sizes = Counter((info.width, info.height) for info in infos if not _has_exif(info))
-    num = sum(count for count in sizes.values() if count > 1)
-    if not num:
-        return
-    of_one_size = len({(info.width, info.height) for info in infos}) == 1
-    logger.info(
-        "%d photos of equal size have no focal length in EXIF and get a camera each; %s",
-        num,
-        "if one camera took them all, use --camera-mode single"
-        if of_one_size
-        else "put those of one camera in a folder of their own and use --camera-mode per-folder",
-    )
+def _tell_of_proposals(infos: Sequence[PhotoInfo], groups: Sequence[Sequence[int]]) -> None:
+    """Announce photos without a focal length that share a camera; ``infos`` holds one photo of each group."""
+    sizes: dict[tuple, int] = {}
+    for info, group in zip(infos, groups, strict=True):
+        if info.focal_px is None and len(group) > 1:
+            logger.info(
+                "%d photos of %d×%d pixels have no focal length in EXIF and are taken to be of one camera "
+                "until their matches say otherwise; --camera-mode per-image gives each its own",
+                len(group),
+                info.width,
+                info.height,
+            )
+        sizes[(info.width, info.height, info.camera_name, info.focal_px)] = len(group)
+    for (width, height, name, focal_px), num in sizes.items():
+        num_turned = sizes.get((height, width, name, focal_px), 0)
+        if width > height and num_turned:
+            logger.info(
+                "photos of %d×%d pixels (%d) and of %d×%d (%d) look like one camera, turned and upright; "
+                "each kind gets a camera, of one focal length where it is known or the matches tell it",
+                *(width, height, num, height, width, num_turned),
+            )
 
 
 def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:
@@ -159,16 +165,12 @@ def _warn_of_zoom(focals: Sequence[tuple[str, float | None]]) -> None:
 
 def _make_camera(infos: Sequence[PhotoInfo], model: str, values: list[float]) -> Camera:
     """The camera of some photos of one size."""
-    import pycolmap
-
     width, height = infos[0].width, infos[0].height
-    known = [info.focal_px for info in infos if info.focal_px is not None]
-    focal = float(np.median(known)) if known else DEFAULT_FOCAL_FACTOR * max(width, height)
-    camera = pycolmap.Camera.create_from_model_name(1, model, focal, width, height)
+    camera = create_camera(model, DEFAULT_FOCAL_FACTOR * max(width, height), width, height)
     if values:
-        camera.params = values
-    camera.has_prior_focal_length = bool(values) or bool(known)
-    return camera_from_pycolmap(camera)
+        return dataclasses.replace(camera, params=tuple(values), has_prior_focal_length=True)
+    known = [info.focal_px for info in infos if info.focal_px is not None]
+    return with_focal_length(camera, float(np.median(known))) if known else camera
 
 
 def _parse_params(model: str, params: str) -> list[float]:
@@ -178,13 +180,15 @@ def _parse_params(model: str, params: str) -> list[float]:
         raise ConfigError(f"camera_model is '{model}', expected one of {known}")
     if not params.strip():
         return []
-    expected = CAMERA_PARAMETERS[model].replace(" ", ", ")
+    expected = CAMERA_PARAMETERS[model].split()
     try:
         values = [float(value) for value in params.split(",")]
     except ValueError:
         values = []
-    if len(values) != len(expected.split(",")) or not np.isfinite(values).all():
-        raise ConfigError(f"camera_params is '{params}', expected the numbers {expected} for {model}")
+    if len(values) != len(expected) or not np.isfinite(values).all():
+        raise ConfigError(
+            f"camera_params is '{params}', expected the numbers {', '.join(expected)} for {model}"
+        )
     return values
 
 

@@ -27,10 +27,8 @@ class ChoicePolicy:
 
     Attributes
     ----------
-    min_explained_share : float
-        A first model that explains as much of the verified matches is good enough.
     min_registered_share : float
-        And registers as many of the photos.
+        A first model that registers as many of the photos, and explains enough, needs no second.
     max_models : int
         Models tried at most, the first one included.
     max_time_factor : float
@@ -41,17 +39,14 @@ class ChoicePolicy:
     min_models : int
         Models tried before the best can be confirmed.
     confirming_share : float
-        Relative poses on which a candidate must agree with the best to confirm it.
+        Relative poses on which a candidate must agree with the best to confirm it. The best must also explain
+        enough and misplace no photo: on a weak pair graph many candidates fall into the same wrong model.
     confirming_predicted : float
         Predicted matches it must reach, as a share of the best's.
-    confirming_explained : float
-        What the best must explain of the pairs that do not contradict it to be confirmed, without a misplaced
-        photo: on a weak pair graph many candidates fall into the same wrong model.
     patience : int
         Candidates in a row without more predicted matches after which the best stands.
     """
 
-    min_explained_share: float = 0.94
     min_registered_share: float = 1.0
     max_models: int = 24
     max_time_factor: float = 25.0
@@ -59,7 +54,6 @@ class ChoicePolicy:
     min_models: int = 9
     confirming_share: float = 0.9
     confirming_predicted: float = 0.97
-    confirming_explained: float = 0.94
     patience: int = 12
 
 
@@ -127,7 +121,7 @@ def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
     """Whether a first model needs no second: it explains enough, holds the photos, and misplaces none."""
     return (
         not model.explained.misplaced
-        and model.explained_share >= policy.min_explained_share
+        and model.explained.is_enough(model.explained_share)
         and model.num_registered >= policy.min_registered_share * num_photos
     )
 
@@ -214,7 +208,7 @@ def _why_stop(outcomes: Sequence[Tried | None], policy: ChoicePolicy) -> str:
     best = _best(tried)
     if (
         len(tried) >= policy.min_models
-        and best.explained.share_of_supported >= policy.confirming_explained
+        and best.explained.is_enough(best.explained.share_of_supported)
         and not best.explained.misplaced
         and _support(best, tried, policy.confirming_predicted) >= policy.confirming_share
     ):

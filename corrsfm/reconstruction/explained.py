@@ -23,6 +23,10 @@ __all__ = ["Explained", "ExplainedPair", "explain"]
 
 MAX_DISTANCE_PX = 4.0
 CONTRADICTED_BELOW = 0.5
+# Right models of the training and validation scenes explain 94.3 % and more. Where texture repeats, verified
+# geometries hold false matches that no model explains: the exact cameras of the sample scene courtyard
+# explain 88 %. Then no pair is contradicted, while a photo in the wrong place contradicts several.
+ENOUGH_SHARE, ENOUGH_UNCONTRADICTED_SHARE = 0.94, 0.85
 MISPLACED_BELOW = 0.6
 
 
@@ -94,6 +98,10 @@ class Explained:
         inside = [pair for pair in self.pairs if pair.is_registered]
         num_verified = sum(pair.num_verified for pair in inside)
         return sum(pair.num_explained for pair in inside) / num_verified if num_verified else 0.0
+
+    def is_enough(self, share: float) -> bool:
+        """Whether a share of explained matches speaks for the model; a lower one does if no pair objects."""
+        return share >= (ENOUGH_SHARE if self.contradicted else ENOUGH_UNCONTRADICTED_SHARE)
 
     @property
     def contradicted(self) -> tuple[ExplainedPair, ...]:

@@ -20,7 +20,7 @@ from corrsfm.reconstruction.explained import Explained
 __all__ = ["Evidence", "Grade", "Verdict", "judge", "thickness"]
 
 # Of the matches of pairs that are not contradicted.
-_GOOD_EXPLAINED, _WRONG_EXPLAINED = 0.94, 0.70
+_WRONG_EXPLAINED = 0.70
 _GOOD_REGISTERED = 0.90
 _GOOD_SUPPORT = 0.80
 # Of the verified matches between registered photos. Repetitive scenes have many small false pairs.
@@ -211,7 +211,7 @@ def _explained(evidence: Evidence) -> _Finding | None:
     # Photos left out and contradicted pairs are findings of their own; this one tells a bent model.
     explained = evidence.explained
     share = explained.share_of_supported
-    if not explained.num_explained or share >= _GOOD_EXPLAINED:
+    if not explained.num_explained or explained.is_enough(share):
         return None
     return _Finding(
         Grade.DOUBTFUL if share >= _WRONG_EXPLAINED else Grade.WRONG,

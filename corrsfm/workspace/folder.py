@@ -11,6 +11,7 @@
     ├── pair_origins.tsv    the strategies that proposed each pair
     ├── matches.h5          putative matches
     ├── pruned.h5           matches that passed pruning
+    ├── cameras.json        which photos share a camera, and by what evidence
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
     ├── evidence.json       why the first model was chosen, and the verdict on it
@@ -111,6 +112,7 @@ class Workspace:
         self.pair_origins = root / "pair_origins.tsv"
         self.matches = root / "matches.h5"
         self.pruned = root / "pruned.h5"
+        self.cameras_json = root / "cameras.json"
         self.database = root / "database.db"
         self.sparse = root / "sparse"
         self.evidence = root / "evidence.json"

@@ -15,6 +15,7 @@ from corrsfm.types import Camera
 PLAIN = PhotoInfo(width=640, height=480)
 PHONE = PhotoInfo(width=640, height=480, camera_name="Acme-One", focal_px=500.0)
 ZOOMED = PhotoInfo(width=640, height=480, camera_name="Acme-One", focal_px=900.0)
+PLAIN_TALL = PhotoInfo(width=480, height=640)
 TALL = PhotoInfo(width=480, height=640, camera_name="Acme-One", focal_px=500.0)
 
 
@@ -27,34 +28,49 @@ def test_auto_shares_a_camera_among_photos_with_the_same_exif() -> None:
     assert ids_of([PHONE, ZOOMED, PHONE, TALL, PHONE], CameraMode.AUTO) == [0, 1, 0, 2, 0]
 
 
-def test_auto_gives_every_photo_without_exif_a_camera_of_its_own() -> None:
-    assert ids_of([PLAIN, PLAIN, PLAIN], CameraMode.AUTO) == [0, 1, 2]
-    assert ids_of([PLAIN, PHONE, PLAIN, PHONE], CameraMode.AUTO) == [0, 1, 2, 1]
+def test_auto_proposes_one_camera_for_photos_of_a_size_without_exif() -> None:
+    assert ids_of([PLAIN, PLAIN, PLAIN], CameraMode.AUTO) == [0, 0, 0]
+    assert ids_of([PLAIN, PHONE, PLAIN, PHONE, PLAIN_TALL], CameraMode.AUTO) == [0, 1, 0, 1, 2]
 
 
-def test_photos_that_may_share_a_camera_are_counted_with_the_option_for_it(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_auto_keeps_cameras_of_other_names_apart_where_none_tells_a_focal_length() -> None:
+    one, two = (dataclasses.replace(PLAIN, camera_name=name) for name in ("Acme-One", "Acme-Two"))
+    assert ids_of([one, two, PLAIN, one], CameraMode.AUTO) == [0, 1, 2, 0]
+
+
+def test_a_proposed_camera_is_announced_with_the_way_out_of_it(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    equal = "photos of equal size have no focal length in EXIF and get a camera each"
     ids_of([PLAIN, PHONE, PLAIN], CameraMode.AUTO)
-    assert caplog.messages == [f"2 {equal}; if one camera took them all, use --camera-mode single"]
-    caplog.clear()
-    ids_of([PLAIN, PLAIN, PLAIN, TALL], CameraMode.AUTO)
     (text,) = caplog.messages
-    assert text.startswith(f"3 {equal};") and text.endswith("use --camera-mode per-folder")
+    assert text.startswith(
+        "2 photos of 640×480 pixels have no focal length in EXIF and are taken to be of one camera"
+    )
+    assert text.endswith("--camera-mode per-image gives each its own")
+
+
+def test_upright_and_turned_photos_are_named_as_one_camera(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    ids_of([PLAIN, PLAIN_TALL, TALL, PLAIN_TALL], CameraMode.AUTO)
+    assert caplog.messages[-1].startswith(
+        "photos of 640×480 pixels (1) and of 480×640 (2) look like one camera"
+    )
+    caplog.clear()
+    ids_of([PHONE, TALL, ZOOMED], CameraMode.AUTO)
+    assert len(caplog.messages) == 1
+    caplog.clear()
+    ids_of([PLAIN, TALL], CameraMode.AUTO)
+    assert not caplog.messages
 
 
 def test_nothing_is_said_of_sharing_where_it_was_decided_or_cannot_be(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level("INFO")
-    ids_of([PLAIN, PHONE, TALL], CameraMode.AUTO)
+    ids_of([PLAIN, PHONE], CameraMode.AUTO)
     ids_of([PLAIN, PLAIN], CameraMode.PER_IMAGE)
     ids_of([PLAIN, PLAIN], CameraMode.SINGLE)
     known = "500,320,240,0"
-    infos = [PLAIN, PLAIN]
-    assign_cameras(["a", "b"], infos, mode=CameraMode.AUTO, model="SIMPLE_RADIAL", params=known)
+    assign_cameras(["a", "b"], [PLAIN, PLAIN], mode=CameraMode.AUTO, model="SIMPLE_RADIAL", params=known)
     assert not caplog.messages
 
 

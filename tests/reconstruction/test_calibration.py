@@ -10,7 +10,13 @@ from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import observation_errors
 from corrsfm.config import ReconstructionConfig
 from corrsfm.reconstruction import mapper as reconstruction
-from corrsfm.reconstruction.calibration import focal_length_ratios, is_plausible, refine_intrinsics
+from corrsfm.reconstruction.calibration import (
+    describe_impossible,
+    focal_length_ratios,
+    has_prior_focal_lengths,
+    is_plausible,
+    refine_intrinsics,
+)
 from corrsfm.reconstruction.mapper import reconstruct
 
 
@@ -103,11 +109,15 @@ def test_mapping_that_bends_is_done_again_with_intrinsics_held(
     assert "looks wrong" not in caplog.text
 
 
-def test_a_model_that_stays_wrong_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_focal_lengths_that_no_camera_has_are_named_and_zoomed_ones_are_not(
+    model: pycolmap.Reconstruction,
 ) -> None:
-    synthesize(tmp_path / "database.db")
-    monkeypatch.setattr(reconstruction, "is_plausible", lambda model: False)
-    with caplog.at_level(logging.WARNING):
-        reconstruct(tmp_path / "database.db", None, tmp_path / "sparse", config=ReconstructionConfig())
-    assert "the model looks wrong" in caplog.text and "--camera-mode single" in caplog.text
+    assert describe_impossible(model) == "" and not has_prior_focal_lengths(model)
+    for number in range(3):
+        set_focal_length(model, number, 3.0)
+    assert not is_plausible(model) and describe_impossible(model) == ""
+    set_focal_length(model, 9, 1e6)
+    assert describe_impossible(model).startswith("focal lengths from ")
+    for camera in model.cameras.values():
+        camera.has_prior_focal_length = True
+    assert describe_impossible(model) == "" and has_prior_focal_lengths(model)

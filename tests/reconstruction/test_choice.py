@@ -49,10 +49,29 @@ def test_a_first_model_that_misses_a_photo_is_not_good_enough() -> None:
 
 
 def test_a_first_model_with_a_misplaced_photo_is_not_good_enough() -> None:
-    lenient = dataclasses.replace(POLICY, min_explained_share=0.4)
-    assert good_enough(tried("first", RIGHT), 4, lenient)
-    assert tried("first", BENT).explained_share >= 0.4
-    assert not good_enough(tried("first", BENT), 4, lenient)
+    right, bent = tried("first", RIGHT), tried("first", BENT)
+    assert good_enough(right, 4, POLICY)
+    assert bent.explained.misplaced == ("3.jpg",)
+    # Even if it explained as much as the right one.
+    pairs = [
+        pair
+        if "3.jpg" in (pair.name0, pair.name1)
+        else dataclasses.replace(pair, num_verified=10**5, num_explained=10**5)
+        for pair in bent.explained.pairs
+    ]
+    loud = dataclasses.replace(bent, explained=dataclasses.replace(bent.explained, pairs=tuple(pairs)))
+    assert loud.explained.is_enough(loud.explained_share)
+    assert not good_enough(loud, 4, POLICY)
+
+
+def test_less_needs_to_be_explained_where_no_pair_contradicts_the_model() -> None:
+    explained = tried("first", RIGHT).explained
+    shared = [dataclasses.replace(pair, num_verified=100, num_explained=88) for pair in explained.pairs]
+    agreeing = dataclasses.replace(explained, pairs=tuple(shared))
+    assert agreeing.share == 0.88 and agreeing.is_enough(agreeing.share)
+    against = dataclasses.replace(shared[0], num_verified=10, num_explained=1)
+    objecting = dataclasses.replace(explained, pairs=(against, *shared[1:]))
+    assert objecting.contradicted and not objecting.is_enough(objecting.share)
 
 
 def test_the_right_model_is_chosen_among_bent_ones_and_confirmed_by_another_right_one() -> None:
