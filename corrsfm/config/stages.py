@@ -247,6 +247,11 @@ class ReconstructionConfig:
         minimum=1,
         used_with=_INCREMENTAL,
     )
+    unfold: bool = option(
+        True,
+        "Map again without the pairs that fold a model by repeated structure, where it betrays itself",
+        used_with=_INCREMENTAL,
+    )
     min_model_size: int = option(3, "Smallest model worth keeping", unit="photos", minimum=2)
     multiple_models: bool = option(True, "Keep several models when the photos do not connect")
     refine_intrinsics: bool = option(

@@ -11,6 +11,7 @@ from corrsfm.reconstruction.selection import Selection
 __all__ = ["FORMAT_VERSION", "record_of"]
 
 FORMAT_VERSION = 1
+_NUM_WORST = 5
 
 
 def record_of(selection: Selection) -> dict[str, Any]:
@@ -25,8 +26,8 @@ def record_of(selection: Selection) -> dict[str, Any]:
     dict
         ``verdict`` (grade, reasons, next steps), ``explained_share``, ``num_predicted_matches`` (null if no
         choice had to be made), ``support``, ``contradicted_pairs``, ``misplaced_photos``, ``loose_ends``,
-        ``pairs`` (verified and explained matches of every verified pair), ``models_tried`` and
-        ``stopped_because``.
+        ``pairs`` (verified and explained matches of every verified pair), ``models_tried``,
+        ``stopped_because`` and ``folds`` (null where too few pairs tell).
     """
     choice, explained = selection.choice, selection.choice.chosen.explained
     return {
@@ -45,6 +46,21 @@ def record_of(selection: Selection) -> dict[str, Any]:
         "pairs": [_pair(pair) for pair in explained.pairs],
         "models_tried": [_tried(model, chosen=model is choice.chosen) for model in choice.tried],
         "num_failed": choice.num_failed,
+        "folds": {
+            "folded": selection.folds.folded,
+            "value": selection.folds.value,
+            "num_near_pairs": selection.folds.num_near_pairs,
+            "worst_pairs": [
+                {
+                    "name0": pair.name0,
+                    "name1": pair.name1,
+                    "share_conflict": pair.share_conflict,
+                    "hole": pair.hole,
+                }
+                for pair in selection.folds.worst(_NUM_WORST)
+            ],
+            "left_out": [list(pair) for pair in selection.left_out],
+        },
         "stopped_because": choice.reason,
     }
 

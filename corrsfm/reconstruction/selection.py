@@ -12,10 +12,20 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.reconstruction.calibration import describe_impossible, has_prior_focal_lengths
-from corrsfm.reconstruction.candidates import Candidate, candidate_bank
+from corrsfm.reconstruction.candidates import Candidate, MapperKind, candidate_bank, map_candidate
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
 from corrsfm.reconstruction.explained import Explained, explain
+from corrsfm.reconstruction.folds.evidence import FoldEvidence
+from corrsfm.reconstruction.folds.unfold import (
+    Attempt,
+    UnfoldRule,
+    best_unfolding,
+    judge_model,
+    try_unfolding,
+)
 from corrsfm.reconstruction.pool import CandidatePool
 from corrsfm.reconstruction.predicted import NeighbourTables, predict, sample_pairs
 from corrsfm.reconstruction.registration import register_again
@@ -89,11 +99,17 @@ class Selection:
     model : pycolmap.Reconstruction
     choice : Choice
     verdict : Verdict
+    folds : FoldEvidence
+        Of the selected model, counted on all verified matches.
+    left_out : tuple of Pair
+        Verified pairs that were left out to unfold the model, sorted; mostly none.
     """
 
     model: pycolmap.Reconstruction
     choice: Choice
     verdict: Verdict
+    folds: FoldEvidence
+    left_out: tuple[Pair, ...] = ()
 
 
 def policy_for(max_models: int, first_seconds: float) -> ChoicePolicy:
@@ -114,8 +130,12 @@ def select_model(
     given_focal_lengths_px: Mapping[int, float] | None = None,
     refine_principal_point: bool = False,
     num_processes: int = 1,
+    unfold: bool = True,
 ) -> Selection | None:
     """Keep the first model if it convinces, else try candidates and take the one that predicts most matches.
+
+    A first model that is folded by repeated structure is unfolded instead: what it predicts and explains
+    would speak for it.
 
     Parameters
     ----------
@@ -125,8 +145,8 @@ def select_model(
     database : Path
         That the first model was made from; not changed.
     workdir : Path
-        Candidates are kept here while the choice goes on, and read again after an interruption; removed at
-        the end. Must be of this database and these options alone.
+        Candidates are kept here and read again after an interruption, so it must be of this database and
+        these options alone; the caller removes it once the choice is safe.
     policy : ChoicePolicy
     first_seconds : float
         What mapping the first model took.
@@ -137,6 +157,8 @@ def select_model(
     refine_principal_point : bool
     num_processes : int
         Candidates mapped at a time; the choice does not depend on it.
+    unfold : bool
+        Try to unfold a folded model.
 
     Returns
     -------
@@ -189,6 +211,11 @@ def select_model(
             start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)
         if start is None:
             return None
+        attempt = judge_model(models[start.name], evidence.verified)
+        if unfold:
+            best = _unfolded(attempt, evidence, database, workdir, seed)
+            if best is not attempt:
+                return _selection_of(best, start, evidence, first_seconds)
         choice = choose_model(
             start,
             bank,
@@ -198,12 +225,70 @@ def select_model(
             policy=policy,
             mend=mend,
         )
-    shutil.rmtree(workdir, ignore_errors=True)
     model = models[choice.chosen.name]
-    return Selection(model=model, choice=choice, verdict=_verdict(model, choice, len(evidence.names)))
+    if choice.chosen is not start:
+        attempt = judge_model(model, evidence.verified)
+    return Selection(
+        model=model,
+        choice=choice,
+        verdict=_verdict(model, choice, len(evidence.names), attempt.evidence),
+        folds=attempt.evidence,
+    )
 
 
-def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int) -> Verdict:
+def _unfolded(first: Attempt, evidence: SceneEvidence, database: Path, workdir: Path, seed: int) -> Attempt:
+    """The best model without pairs that fold the first one; the first one if nothing is better.
+
+    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
+    """
+    attempts = try_unfolding(
+        first,
+        evidence.verified,
+        lambda removed: _map_without(removed, database, workdir / "unfolded", seed),
+        rules=tuple(UnfoldRule) if first.evidence.folded else (UnfoldRule.VOTES,),
+    )
+    return best_unfolding(first, attempts)
+
+
+def _map_without(
+    removed: Sequence[Pair], database: Path, workdir: Path, seed: int
+) -> pycolmap.Reconstruction | None:
+    """The model of the verified pairs without some of them."""
+    shutil.rmtree(workdir, ignore_errors=True)
+    workdir.mkdir(parents=True)
+    copy = workdir / "database.db"
+    copy_database(database, copy)
+    with colmap_log(), database_errors(copy), pycolmap.Database.open(copy) as tables:
+        ids = {image.name: image.image_id for image in tables.read_all_images()}
+        for name0, name1 in removed:
+            tables.delete_two_view_geometry(ids[name0], ids[name1])
+    return map_candidate(Candidate(mapper=MapperKind.INCREMENTAL, seed=seed), copy, workdir / "model")
+
+
+def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first_seconds: float) -> Selection:
+    """An unfolded model as the selection; what it explains is counted without the pairs left out."""
+    views = views_of(attempt.model)
+    left_out = set(attempt.removed)
+    verified = {pair: matches for pair, matches in evidence.verified.items() if pair not in left_out}
+    chosen = Tried(
+        name="-".join(["unfolded", *attempt.rules]),
+        views=views,
+        explained=explain(views, evidence.keypoints, verified),
+        seconds=first_seconds,
+    )
+    choice = Choice(
+        chosen=chosen, tried=(first, chosen), reason="the first model was folded by repeated structure"
+    )
+    return Selection(
+        model=attempt.model,
+        choice=choice,
+        verdict=_verdict(attempt.model, choice, len(evidence.names), attempt.evidence),
+        folds=attempt.evidence,
+        left_out=attempt.removed,
+    )
+
+
+def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, folds: FoldEvidence) -> Verdict:
     points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
     return judge(
         Evidence(
@@ -213,5 +298,7 @@ def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int) ->
             implausible_intrinsics=describe_impossible(model),
             has_prior_focal_lengths=has_prior_focal_lengths(model),
             thickness=thickness(points),
+            is_folded=folds.folded,
+            conflicts=[f"{pair.name0} – {pair.name1}" for pair in folds.worst(3)] if folds.folded else (),
         )
     )

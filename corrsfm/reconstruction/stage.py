@@ -130,12 +130,15 @@ class _Choice:
                 seed=run.seed,
                 refine_principal_point=self._config.refine_principal_point,
                 num_processes=count_threads(run.threads),
+                unfold=self._config.unfold,
             )
         if workspace.candidates.is_dir():
             shutil.rmtree(workspace.candidates)
         if self.selection is None:
             return None
         choice = self.selection.choice
+        if self.selection.left_out:
+            logger.info("unfolded: %d pairs of look-alike places were left out", len(self.selection.left_out))
         if len(choice.tried) > 1:
             logger.info(
                 "models tried: %d (%s); chosen: %s", len(choice.tried), choice.reason, choice.chosen.name

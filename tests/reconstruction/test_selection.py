@@ -1,0 +1,139 @@
+"""The first model stays if it convinces; a bent one gives way to the true one, and the record says why."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from synthetic_database import synthesize
+
+from corrsfm.colmap.pairs import read_verified_matches
+from corrsfm.reconstruction import selection
+from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.record import record_of
+from corrsfm.reconstruction.selection import SceneEvidence, Selection, policy_for, select_model
+from corrsfm.reconstruction.verdict import Grade
+from corrsfm.reconstruction.views import views_of
+from corrsfm.types import Features
+
+
+class Scene:
+    """A synthesized database with descriptors: photos that see a point describe it alike."""
+
+    def __init__(self, folder: Path) -> None:
+        self.database = folder / "database.db"
+        self.workdir = folder / "candidates"
+        self.truth = synthesize(self.database)
+        self.loaded: list[str] = []
+        prints = np.random.default_rng(0).integers(0, 256, (1 + max(self.truth.points3D), 128))
+        self._features = {}
+        for image in self.truth.images.values():
+            ids = [point.point3D_id if point.has_point3D() else 0 for point in image.points2D]
+            num = len(ids)
+            self._features[image.name] = Features(
+                keypoints=np.array([point.xy for point in image.points2D], np.float32),
+                scales=np.ones(num, np.float32),
+                orientations=np.zeros(num, np.float32),
+                scores=np.ones(num, np.float32),
+                descriptors=prints[ids].astype(np.uint8),
+                image_size=(image.camera.width, image.camera.height),
+            )
+        self.evidence = SceneEvidence(
+            list(self._features), read_verified_matches(self.database), self._features.__getitem__
+        )
+
+    def select(self, first: pycolmap.Reconstruction | None, **options: object) -> Selection | None:
+        return select_model(
+            first,
+            self.evidence,
+            self.database,
+            self.workdir,
+            policy=policy_for(8, 1.0),
+            first_seconds=1.0,
+            **options,  # type: ignore[arg-type]
+        )
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path)
+
+
+def bent(truth: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The true model with one photo turned away by 20 degrees."""
+    model = pycolmap.Reconstruction(truth)
+    image = min(model.images.values(), key=lambda image: image.name)
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, np.radians(20), 0.0])), np.zeros(3))
+    image.frame.set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    return model
+
+
+def test_a_first_model_that_convinces_stays_and_nothing_else_is_mapped(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(selection.CandidatePool, "map", lambda *_: pytest.fail("mapped a candidate"))
+    selected = scene.select(scene.truth)
+    assert selected is not None and selected.model is scene.truth
+    assert selected.verdict.grade is Grade.GOOD
+    assert selected.choice.chosen.num_predicted is None
+    assert selected.left_out == ()
+
+
+def test_a_bent_first_model_gives_way_to_one_that_predicts_more(scene: Scene) -> None:
+    first = bent(scene.truth)
+    assert agreement(views_of(scene.truth), views_of(first)).share < 0.8
+    selected = scene.select(first)
+    assert selected is not None
+    common = agreement(views_of(scene.truth), views_of(selected.model))
+    assert (common.num_photos, common.share) == (8, 1.0)
+    tried = selected.choice.tried
+    assert tried[0].name == "first" and tried[0].explained.misplaced
+    assert (selected.choice.chosen.num_predicted or 0) > (tried[0].num_predicted or 0) > 0
+
+
+def test_a_candidate_stands_in_for_a_first_model_that_did_not_come(scene: Scene) -> None:
+    selected = scene.select(None)
+    assert selected is not None
+    assert agreement(views_of(scene.truth), views_of(selected.model)).share == 1.0
+
+
+def test_nothing_is_selected_where_nothing_can_be_mapped(scene: Scene) -> None:
+    with pycolmap.Database.open(scene.database) as database:
+        database.clear_two_view_geometries()
+    assert scene.select(None) is None
+
+
+def test_candidates_of_an_interrupted_choice_are_not_mapped_again(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.select(bent(scene.truth))
+    finished = {path.parent.name for path in scene.workdir.glob("*/candidate.json")}
+    assert finished
+    mapped: list[str] = []
+    original = pycolmap.incremental_mapping
+
+    def spy(*arguments: object, **options: object) -> object:
+        mapped.append(str(arguments[2]))
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", spy)
+    scene.select(bent(scene.truth))
+    assert not [path for path in mapped if Path(path).parent.name in finished]
+
+
+def test_the_record_is_plain_and_tells_the_choice(scene: Scene) -> None:
+    selected = scene.select(bent(scene.truth))
+    assert selected is not None
+    record = json.loads(json.dumps(record_of(selected), allow_nan=False))
+    assert record["verdict"]["grade"] == str(selected.verdict.grade)
+    assert [model["chosen"] for model in record["models_tried"]].count(True) == 1
+    assert record["num_predicted_matches"] == selected.choice.chosen.num_predicted
+    assert len(record["pairs"]) == len(scene.evidence.verified)
+    assert record["folds"]["left_out"] == []
+
+
+def test_a_large_scene_spends_less_on_other_models_than_a_small_one() -> None:
+    assert policy_for(24, 2.0).max_time_factor == 25.0
+    assert policy_for(24, 60.0).max_time_factor == 4.0
+    assert policy_for(24, 36000.0).max_time_factor == pytest.approx(2.0, abs=0.01)
