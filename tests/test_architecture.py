@@ -55,7 +55,7 @@ OWNERS: dict[str, set[str]] = {
     "click": {"cli"},
     "tqdm": {"cli", "workspace", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},
-    "poselib": {"evaluation"},
+    "poselib": {"database", "evaluation"},
 }  # fmt: skip
 
 

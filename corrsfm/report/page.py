@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +63,7 @@ def write_html(
         If the page cannot be written.
     """
     sections = [
+        _verdict(report),
         _tiles(report),
         _missing(report, images_dir),
         section("Model", _model_view(make_view(model))) if model is not None else "",
@@ -80,6 +81,21 @@ def _subtitle(report: SceneReport) -> str:
     method = next((section["method"] for section in sections if "method" in section), None)
     made_by = f"corrsfm {report.versions['corrsfm']}" if "corrsfm" in report.versions else "corrsfm"
     return html.escape(f"Reconstruction by {made_by}" + (f", matches pruned by {method}" if method else ""))
+
+
+def _verdict(report: SceneReport) -> str:
+    """The verdict on the first model and what it rests on, above everything else."""
+    if not report.verdict:
+        return ""
+    grade = report.evidence["verdict"]["grade"]
+    facts = [f"{100 * report.evidence['explained_share']:.1f} % of the verified matches are explained"]
+    if (predicted := report.evidence.get("num_predicted_matches")) is not None:
+        num = len(report.evidence["models_tried"])
+        facts.append(f"{num} models were tried; this one predicts {predicted:,} matches")
+    if left_out := report.evidence.get("folds", {}).get("left_out"):
+        facts.append(f"{len(left_out)} pairs of look-alike places were left out to unfold it")
+    verdict, note = html.escape(report.verdict), html.escape("; ".join(facts))
+    return f'<p class="verdict {grade}"><b>{verdict}</b><br>{note}</p>'
 
 
 def _tiles(report: SceneReport) -> str:
@@ -203,7 +219,7 @@ def _view_graph(report: SceneReport) -> str:
 def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMatches | None) -> str:
     drawn = []
     if images_dir is not None and load_matches is not None:
-        for kind, pair in _pairs_to_draw(report.pairs):
+        for kind, pair in _pairs_to_draw(report):
             figure = _drawn_pair(kind, pair, images_dir, load_matches)
             if figure:
                 drawn.append(figure)
@@ -231,9 +247,18 @@ def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMat
     )
 
 
-def _pairs_to_draw(pairs: Sequence[PairStatistics]) -> list[tuple[str, PairStatistics]]:
-    """Three of the strongest and the three weakest verified pairs, the strongest ones of different photos."""
-    ranked = sorted((pair for pair in pairs if pair.num_verified > 0), key=lambda pair: -pair.num_verified)
+def _pairs_to_draw(report: SceneReport) -> list[tuple[str, PairStatistics]]:
+    """Three contradicted pairs, and of the other verified ones the three weakest and three strong ones.
+
+    The strong ones are of different photos.
+    """
+    against = {frozenset(pair): rank for rank, pair in enumerate(report.contradicted_pairs[:_DRAWN_PAIRS])}
+    contradicted = [pair for pair in report.pairs if frozenset((pair.name0, pair.name1)) in against]
+    contradicted.sort(key=lambda pair: against[frozenset((pair.name0, pair.name1))])
+    ranked = sorted(
+        (pair for pair in report.pairs if pair.num_verified > 0 and pair not in contradicted),
+        key=lambda pair: -pair.num_verified,
+    )
     strong: list[PairStatistics] = []
     seen: set[str] = set()
     for pair in ranked:
@@ -241,7 +266,11 @@ def _pairs_to_draw(pairs: Sequence[PairStatistics]) -> list[tuple[str, PairStati
             strong.append(pair)
             seen |= {pair.name0, pair.name1}
     weak = [pair for pair in ranked if pair not in strong][-_DRAWN_PAIRS:]
-    return [("strong", pair) for pair in strong] + [("weak", pair) for pair in weak]
+    return (
+        [("contradicted by the model", pair) for pair in contradicted]
+        + [("strong", pair) for pair in strong]
+        + [("weak", pair) for pair in weak]
+    )
 
 
 def _drawn_pair(kind: str, pair: PairStatistics, images_dir: Path, load_matches: LoadMatches) -> str:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +51,8 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
         stage_seconds={stage: record.seconds for stage, record in records.items()},
         configuration={stage: record.config for stage, record in records.items()},
         versions=versions(),
+        evidence=_read_record(workspace.evidence) if "models" in records else {},
+        camera_remarks=_read_record(workspace.cameras_json).get("remarks", []),
     )
     atomic_write_json(workspace.report_json, summary.to_dict())
     if html:
@@ -59,6 +64,17 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
             load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
         )
     return summary
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    """A record that a stage left for the report; empty if an older version left none or it is damaged."""
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError) as error:
+        logger.warning("%s: cannot be read (%s); the report goes without it", path, error)
+        return {}
 
 
 def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:

@@ -43,6 +43,11 @@ class SceneReport:
         The options of the run.
     versions : dict
         Program → version.
+    evidence : dict
+        Why the first model was selected and the verdict on it, see `corrsfm.reconstruction.record.record_of`;
+        empty for models that were taken as they came.
+    camera_remarks : tuple of str
+        Which photos share a camera and by what evidence, where EXIF did not tell.
     """
 
     scene: str
@@ -54,6 +59,22 @@ class SceneReport:
     stage_seconds: dict[str, float]
     configuration: dict[str, Any]
     versions: dict[str, str]
+    evidence: dict[str, Any] = dataclasses.field(default_factory=dict)
+    camera_remarks: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one line; empty if there is none."""
+        if "verdict" not in self.evidence:
+            return ""
+        verdict = self.evidence["verdict"]
+        step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
+        return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
+
+    @property
+    def contradicted_pairs(self) -> list[tuple[str, str]]:
+        """Verified pairs that the first model contradicts, the least explained first."""
+        return [(pair["name0"], pair["name1"]) for pair in self.evidence.get("contradicted_pairs", [])]
 
     @property
     def num_registered(self) -> int:
@@ -119,7 +140,11 @@ class SceneReport:
                 "num_verified_matches": verified,
                 "num_components": len(self.components),
                 "seconds": sum(self.stage_seconds.values()),
+                "verdict": self.evidence["verdict"]["grade"] if self.verdict else None,
+                "explained_share": self.evidence.get("explained_share"),
+                "num_predicted_matches": self.evidence.get("num_predicted_matches"),
             },
+            "verdict": self.evidence.get("verdict"),
             **{entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)},
         }
         plain: dict[str, Any] = _plain(values)
@@ -139,6 +164,8 @@ def make_report(
     stage_seconds: Mapping[str, float] | None = None,
     configuration: Mapping[str, Any] | None = None,
     versions: Mapping[str, str] | None = None,
+    evidence: Mapping[str, Any] | None = None,
+    camera_remarks: Iterable[str] = (),
 ) -> SceneReport:
     """Build the report of a scene and find out why photos are missing.
 
@@ -156,8 +183,9 @@ def make_report(
         Photos that could not be read.
     mapped : bool
         False if the pairs have not been mapped yet, so that there are no models for that reason alone.
-    stage_seconds, configuration, versions : mapping, optional
+    stage_seconds, configuration, versions, evidence : mapping, optional
         See `SceneReport`.
+    camera_remarks : iterable of str, optional
 
     Returns
     -------
@@ -178,6 +206,8 @@ def make_report(
         stage_seconds=dict(stage_seconds or {}),
         configuration=dict(configuration or {}),
         versions=dict(versions or {}),
+        evidence=dict(evidence or {}),
+        camera_remarks=tuple(camera_remarks),
     )
 
 

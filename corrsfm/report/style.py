@@ -67,6 +67,10 @@ svg .axis { font-size: 12.5px; fill: var(--ink); }
 .white { background: #ffffff; }
 summary { cursor: pointer; color: var(--quiet); padding: 6px 0; }
 ol, pre { font-size: .85rem; overflow: auto; max-height: 320px; overflow-wrap: anywhere; }
+.verdict { border-left: 6px solid var(--line); background: var(--card); padding: 12px 16px; margin: 18px 0; }
+.verdict.good { border-color: #009e73; }
+.verdict.doubtful { border-color: #e69f00; }
+.verdict.wrong { border-color: #d55e00; }
 .best { font-weight: 600; }
 .failure { color: #a33; }
 .numbers td.failure { text-align: left; }

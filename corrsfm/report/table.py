@@ -41,12 +41,14 @@ def statistics_rows(report: SceneReport) -> list[tuple[str, str]]:
     """The statistics as pairs of label and value, in the order they are read."""
     rows = [
         ("scene", report.scene),
+        *([("verdict", report.verdict)] if report.verdict else []),
         (
             "photos",
             f"{report.num_registered:,} of {len(report.image_names):,} registered "
             f"({report.registered_percent:.1f} %){_in_models(report)}",
         ),
         ("models", _models(report)),
+        *(("cameras" if not number else "", text) for number, text in enumerate(report.camera_remarks)),
     ]
     if report.models:
         model = report.models[0]

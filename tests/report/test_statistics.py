@@ -160,7 +160,7 @@ def test_report_survives_json() -> None:
     made = report()
     read = json.loads(json.dumps(made.to_dict(), allow_nan=False))
     assert math.isnan(made.models[1].mean_error_px) and read["models"][1]["mean_error_px"] is None
-    assert list(read)[2:] == [entry.name for entry in dataclasses.fields(made)]
+    assert list(read)[2:] == ["verdict", *(entry.name for entry in dataclasses.fields(made))]
     for written, model in zip(read["models"], made.models, strict=True):
         kept = {name: value for name, value in written.items() if value is not None}
         assert ModelSummary(**dataclasses.asdict(model) | kept | {"image_names": model.image_names}) == model
