@@ -52,5 +52,5 @@ def test_a_list_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cannot be read \(Is a directory\)$"):
         read_lines(tmp_path)
     (tmp_path / "latin.txt").write_bytes(b"caf\xe9.jpg")
-    with pytest.raises(InputError, match=r"latin\.txt: is no UTF-8 text .*; save it as UTF-8"):
+    with pytest.raises(InputError, match=r"latin\.txt: is not UTF-8 text .*; save it as UTF-8"):
         read_lines(tmp_path / "latin.txt")

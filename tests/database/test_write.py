@@ -252,7 +252,7 @@ def test_image_without_keypoints_is_kept(tmp_path: Path) -> None:
     ("pair", "message"),
     [
         ((NAMES[0], "c.jpg", np.zeros((0, 2), np.int32)), "c.jpg is not among the photos"),
-        ((NAMES[0], NAMES[0], np.zeros((0, 2), np.int32)), "matched with itself"),
+        ((NAMES[0], NAMES[0], np.zeros((0, 2), np.int32)), "paired with itself"),
         ((NAMES[0], NAMES[1], np.array([[0, 60]], np.int32)), "keypoint 60 of a/1.jpg, which has 60"),
         ((NAMES[0], NAMES[1], np.array([[-1, 0]], np.int32)), "keypoint -1 of a b/größe.jpg"),
         ((NAMES[0], NAMES[1], np.zeros((3, 2), np.float32)), "expected integers"),

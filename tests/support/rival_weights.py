@@ -1,7 +1,7 @@
 """Weights, pairs and goldens of the rival networks that anyone can make again.
 
-``PYTHONPATH=. python tests/model/rival_weights.py`` writes ``rivals_golden.npz``: outputs of a small network
-of each kind, in float64. Weights and inputs are exact in float32. The script takes the first weights whose
+``PYTHONPATH=. python tests/support/rival_weights.py`` writes ``tests/data/rivals_golden.npz``: outputs of a
+small network of each kind, in float64. Weights and inputs are exact in float32. The script takes the first weights whose
 numbers a change of 1e-12 in the inputs moves by less than a tenth of `GOLDEN_TOLERANCE`, choices of
 neighbours and ranks included, and with which every estimate rests on enough correspondences.
 """
@@ -14,7 +14,7 @@ import torch
 
 from corrsfm.model.rivals import ARCHITECTURES, Rival, RivalConfig, RivalOutput, build_rival
 
-GOLDEN_FILE = Path(__file__).with_name("rivals_golden.npz")
+GOLDEN_FILE = Path(__file__).parents[1] / "data" / "rivals_golden.npz"
 
 # Relative to the largest value of an array. Rounding moves these networks as inputs do that change by some
 # 1e-13, the error of a sum of a thousand terms in float64.
