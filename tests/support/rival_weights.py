@@ -2,8 +2,8 @@
 
 ``PYTHONPATH=. python tests/support/rival_weights.py`` writes ``tests/data/rivals_golden.npz``: outputs of a
 small network of each kind, in float64. Weights and inputs are exact in float32. The script takes the first
-weights whose numbers a change of 1e-12 in the inputs moves by less than a tenth of `GOLDEN_TOLERANCE`, choices of
-neighbours and ranks included, and with which every estimate rests on enough correspondences.
+weights whose numbers a change of 1e-12 in the inputs moves by less than a tenth of `GOLDEN_TOLERANCE`,
+choices of neighbours and ranks included, and with which every estimate rests on enough correspondences.
 """
 
 import zlib
