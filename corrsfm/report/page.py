@@ -88,14 +88,15 @@ def _verdict(report: SceneReport) -> str:
     if not report.verdict:
         return ""
     grade = report.evidence["verdict"]["grade"]
-    facts = [f"{100 * report.evidence['explained_share']:.1f} % of the verified matches are explained"]
+    facts = []
     if (predicted := report.evidence.get("num_predicted_matches")) is not None:
         num = len(report.evidence["models_tried"])
         facts.append(f"{num} models were tried; this one predicts {predicted:,} matches")
     if left_out := report.evidence.get("folds", {}).get("left_out"):
-        facts.append(f"{len(left_out)} pairs of look-alike places were left out to unfold it")
-    verdict, note = html.escape(report.verdict), html.escape("; ".join(facts))
-    return f'<p class="verdict {grade}"><b>{verdict}</b><br>{note}</p>'
+        pairs = "1 pair" if len(left_out) == 1 else f"{len(left_out)} pairs"
+        facts.append(f"{pairs} of look-alike places left out to unfold it")
+    note = f"<br>{html.escape('; '.join(facts))}" if facts else ""
+    return f'<p class="verdict {grade}"><b>{html.escape(report.verdict)}</b>{note}</p>'
 
 
 def _tiles(report: SceneReport) -> str:
@@ -121,7 +122,7 @@ def _statistics(report: SceneReport) -> str:
     rows = "".join(
         f"<tr><th>{html.escape(label)}</th><td>{html.escape(value)}</td></tr>"
         for label, value in statistics_rows(report)
-        if label not in ("scene", "seconds")
+        if label not in ("scene", "verdict", "seconds")
     )
     table = f'<div class="scroll"><table class="facts">{rows}</table></div>'
     if len(report.models) < 2:

@@ -230,3 +230,31 @@ def test_view_is_upright_and_looks_along_y(model) -> None:
     np.testing.assert_allclose(
         np.linalg.norm(view.centres - view.centres[0], axis=1), np.linalg.norm(centres - centres[0], axis=1)
     )
+
+
+def test_the_verdict_stands_above_the_numbers_with_what_was_tried(tmp_path: Path) -> None:
+    evidence = {
+        "verdict": {"grade": "doubtful", "reasons": ["9 of 10 <b>photos"], "next_steps": ["more photos"]},
+        "explained_share": 0.9,
+        "num_predicted_matches": 12345,
+        "models_tried": [{}, {}],
+        "contradicted_pairs": [{"name0": "a.jpg", "name1": "b.jpg"}],
+        "folds": {"left_out": [["a.jpg", "b.jpg"]]},
+    }
+    made = make_report(scene="x", image_names=["a.jpg", "b.jpg"], pairs=[], models=[], evidence=evidence)
+    write_html(made, tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    verdict = '<p class="verdict doubtful"><b>doubtful: 9 of 10 &lt;b&gt;photos; try more photos</b><br>'
+    assert text.index(verdict) < text.index('<div class="tiles">')
+    assert "2 models were tried; this one predicts 12,345 matches; 1 pair of look-alike places left" in text
+    assert made.contradicted_pairs == [("a.jpg", "b.jpg")]
+    plain = made.to_dict()
+    assert plain["verdict"]["grade"] == plain["summary"]["verdict"] == "doubtful"
+    assert plain["summary"]["num_predicted_matches"] == 12345
+
+
+def test_a_model_that_was_taken_as_it_came_has_no_verdict(tmp_path: Path) -> None:
+    made = make_report(scene="x", image_names=["a.jpg", "b.jpg"], pairs=[], models=[])
+    write_html(made, tmp_path / "page.html")
+    assert '<p class="verdict' not in (tmp_path / "page.html").read_text()
+    assert made.to_dict()["verdict"] is None and made.to_dict()["summary"]["verdict"] is None
