@@ -106,8 +106,8 @@ class ImagesConfig:
     )
     camera_mode: CameraMode = option(
         CameraMode.AUTO,
-        "Which photos share a camera; auto groups equal size, make, model and focal length, and photos of one "
-        "size without EXIF unless their matches object",
+        "Which photos share a camera; auto groups equal size, make, model and focal length, and photos of "
+        "one size without EXIF unless their matches object",
     )
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
     skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
