@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import statistics
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -158,6 +160,38 @@ def _pycolmap_table(values: dict[str, Any]) -> Table:
     return Table(header=header, rows=rows, caption=caption)
 
 
+def _seeds_table(values: dict[str, Any]) -> Table:
+    header = [
+        "scene",
+        "setting",
+        "AUC@5 median",
+        "worst",
+        "registered",
+        "models tried",
+        "verdicts",
+        "seconds",
+    ]
+    rows = []
+    for row in values["rows"]:
+        runs = row["runs"]
+        scores = [run["auc5"] for run in runs]
+        grades = Counter(run["grade"] for run in runs if run["grade"])
+        rows.append(
+            [
+                row["scene"],
+                row["setting"],
+                _number(statistics.median(scores)),
+                _number(min(scores)),
+                f"{min(run['num_registered'] for run in runs)}/{runs[0]['num_photos']}",
+                str(max(run["num_tried"] for run in runs)),
+                ", ".join(f"{num} {grade}" for grade, num in sorted(grades.items())) or "–",
+                _number(statistics.median(run["seconds"] for run in runs)),
+            ]
+        )
+    num_seeds = len(values["rows"][0]["runs"])
+    return Table(header=header, rows=rows, caption=f"{num_seeds} seeds. {_origin(values)}")
+
+
 def _bench_table(values: dict[str, Any]) -> Table:
     header = ["matches", "batch", "device", "variant", "pairs/s", "speed ×", "memory ×"]
     rows = [
@@ -199,6 +233,7 @@ _RENDERERS: dict[str, Callable[[dict[str, Any]], Table]] = {
     "compare": _compare_table,
     "pycolmap": _pycolmap_table,
     "bench": _bench_table,
+    "scene_seeds": _seeds_table,
 }
 
 

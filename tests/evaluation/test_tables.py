@@ -51,3 +51,19 @@ def test_other_results_of_the_project_have_a_table(repository: Path, name: str):
     table = render_table(values)
     assert len(values["rows"]) >= 4
     assert table.count("\n| ") >= len(values["rows"])
+
+
+def test_whole_scenes_over_seeds_show_the_median_the_worst_and_the_verdicts() -> None:
+    runs = [
+        {"seed": seed, "auc5": auc, "num_registered": 9 + seed % 2, "num_photos": 10, "grade": grade,
+         "num_tried": seed + 1, "seconds": 2.0 + seed}
+        for seed, (auc, grade) in enumerate([(80.0, "good"), (60.0, "doubtful"), (90.0, "good")])
+    ]  # fmt: skip
+    values = {
+        "kind": "scene_seeds",
+        "provenance": {"versions": {"corrsfm": "0.1.0"}, "seed": 0},
+        "rows": [{"scene": "desk", "setting": "default", "runs": runs}],
+    }
+    text = render_table(values)
+    assert "| desk | default | 80.0 | 60.0 | 9/10 | 3 | 1 doubtful, 2 good | 3.0 |" in text
+    assert "3 seeds. corrsfm 0.1.0" in text
