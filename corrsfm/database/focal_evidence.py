@@ -46,7 +46,7 @@ _MIN_VOTE_ITERATIONS, _MAX_VOTE_ITERATIONS = 100, 1000
 _CURVE_ITERATIONS = 15
 # Width of the kernel around a vote, in log f: 5 %.
 _KERNEL_WIDTH = 0.05
-# A pair refuses a focal length that turns so many of its inliers into outliers.
+# A pair refuses a focal length that turns this share of its inliers into outliers.
 _REFUSED_SHARE = 0.1
 
 

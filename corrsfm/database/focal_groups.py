@@ -24,7 +24,7 @@ __all__ = ["Split", "split_in_two"]
 
 # Focal lengths closer than 12 % are not told apart; few zooms reach farther than a factor of three.
 _MIN_FACTOR, _MAX_FACTOR = 1.12, 3.1
-# One of the two focal lengths is where votes are dense; so many such places are tried.
+# One of the two focal lengths is where votes are dense; number of such places tried.
 _NUM_ANCHORS = 3
 
 

@@ -46,7 +46,7 @@ _LONG_RATIO = 2.0
 # Focal lengths that meet 2 % more objection than the best are as good; decided ones lie in such a range.
 _AS_GOOD, _LARGEST_RANGE_FACTOR = 0.02, 1.4
 
-# Two groups hold so many photos each, and leave no more objection than this, and than this share of the
+# Smallest group, and the most objection that two groups may leave: this much, and this share of the
 # objection to one focal length.
 _MIN_GROUP_SIZE = 3
 _LARGEST_LEFT, _LARGEST_SHARE_LEFT = 0.2, 0.6

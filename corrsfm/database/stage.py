@@ -111,7 +111,7 @@ def _decide_cameras(
     pairs: Sequence[Pair],
     seed: int,
 ) -> tuple[list[ImageRecord], list[Camera], list[str]]:
-    """The photos with the cameras that the kept matches speak for, and a remark on each decision."""
+    """Assign cameras by the votes of the kept matches, with a remark on each decision."""
     # Sharing that the user asked for is not undone.
     asked_for = workspace.require("images").config["camera_mode"] != cfg.CameraMode.AUTO
     votes = {}

@@ -43,7 +43,7 @@ class BenchmarkRow:
     pairs_per_second : float
         From the median time of the repetitions.
     peak_mib : float or None
-        Memory that a batch needs beyond weights and input, MiB; None if the system does not tell.
+        Memory that a batch needs beyond weights and input, MiB; None if the system does not report it.
     speed_ratio : float
         Pairs per second over those of the reference.
     memory_ratio : float or None

@@ -100,7 +100,7 @@ class Explained:
         return sum(pair.num_explained for pair in inside) / num_verified if num_verified else 0.0
 
     def is_enough(self, share: float) -> bool:
-        """Whether a share of explained matches speaks for the model; a lower one does if no pair objects."""
+        """Whether a share of explained matches is enough; a lower one is if no pair is contradicted."""
         return share >= (ENOUGH_SHARE if self.contradicted else ENOUGH_UNCONTRADICTED_SHARE)
 
     @property

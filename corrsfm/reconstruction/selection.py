@@ -134,8 +134,8 @@ def select_model(
 ) -> Selection | None:
     """Keep the first model if it convinces, else try candidates and take the one that predicts most matches.
 
-    A first model that is folded by repeated structure is unfolded instead: what it predicts and explains
-    would speak for it.
+    A first model that is folded by repeated structure is unfolded instead: a fold predicts and
+    explains as much as a right model.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def select_model(
 
 
 def _unfolded(first: Attempt, evidence: SceneEvidence, database: Path, workdir: Path, seed: int) -> Attempt:
-    """The best model without pairs that fold the first one; the first one if nothing is better.
+    """The best model without pairs that fold the first one; or the first one.
 
     Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
     """

@@ -115,7 +115,7 @@ class _Choice:
         self, first: pycolmap.Reconstruction | None, seconds: float
     ) -> pycolmap.Reconstruction | None:
         workspace, run = self._workspace, self._run
-        # Candidates of other matches or options are of no use any more.
+        # Drop candidates that were mapped from other matches or options.
         for folder in workspace.candidates.glob("*"):
             if folder != self._workdir:
                 shutil.rmtree(folder)

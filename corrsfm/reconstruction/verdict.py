@@ -1,6 +1,6 @@
 """The verdict on a model: good, doubtful or wrong, why, and what to do next.
 
-Each kind of evidence speaks for itself and the worst one decides. The bounds are set on training and
+Each kind of evidence is judged alone, and the worst one decides. The bounds are set on training and
 validation scenes; `results/` has the table.
 """
 
@@ -49,7 +49,7 @@ class Verdict:
     ----------
     grade : Grade
     reasons : tuple of str
-        Clauses, the gravest first; for a good model what speaks for it.
+        Clauses, the gravest first; for a good model its strengths.
     next_steps : tuple of str
         What to try, in order; empty for a good model.
     """
@@ -250,7 +250,7 @@ def _misplaced(evidence: Evidence) -> _Finding | None:
 def _support(evidence: Evidence) -> _Finding | None:
     if evidence.support is None or evidence.support >= _GOOD_SUPPORT:
         return None
-    # Missing confirmation is no proof against a model.
+    # A model without confirmation may still be right.
     return _Finding(
         Grade.DOUBTFUL,
         f"the best other candidate agrees about {_percent(evidence.support)} of the relative poses only"

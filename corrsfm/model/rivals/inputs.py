@@ -177,7 +177,7 @@ def keep_best(
     mask : Tensor, shape (B,N) bool, optional
     ratio : float
     min_rows : int
-        Return at least so many columns, padding among them.
+        Smallest number of columns to return, padding included.
 
     Returns
     -------

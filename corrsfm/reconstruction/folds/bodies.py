@@ -136,7 +136,7 @@ def outvoted_pairs(votes: list[RotationVote]) -> tuple[Pair, ...]:
         support = (inliers * (apart < _AGREE_DEG)).sum(axis=1)
         winner = int(support.argmax())
         agrees = apart[winner] < _AGREE_DEG
-        # An opinion that overlaps with the winner's is no rival.
+        # An opinion that overlaps with the winner's does not count as a rival.
         rivals = support[apart[winner] >= 2 * _AGREE_DEG]
         clear = agrees.sum() >= 2 and support[winner] >= _CLEAR_LEAD * rivals.max(initial=0)
         if clear and _angles_deg(rotations[winner]) >= _AGREE_DEG:

@@ -99,7 +99,7 @@ class NearPair:
 
 @dataclass(frozen=True, kw_only=True)
 class FoldEvidence:
-    """How much speaks for a model that is folded.
+    """Evidence for or against a folded model.
 
     Attributes
     ----------
