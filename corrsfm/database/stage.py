@@ -15,9 +15,9 @@ from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.sqlite import is_truncated
 from corrsfm.config import config_hash
+from corrsfm.database.cameras_by_votes import assign_by_votes, cameras_that_vote
 from corrsfm.database.focal_evidence import PairPoints
 from corrsfm.database.focal_votes import VoteDecision, count_votes
-from corrsfm.database.shared_cameras import assign_by_votes, cameras_that_vote
 from corrsfm.database.write import write_database
 from corrsfm.files import atomic_write_json
 from corrsfm.machine import count_threads

@@ -1,1 +1,19 @@
-"""Verified pairs become models."""
+"""Verified pairs become models, and one of several is chosen.
+
+::
+
+    reconstruction/
+    ├── stage.py         files to files
+    ├── mapper.py        one run of pycolmap's mappers
+    ├── best_model.py    the model of a scene: judged, and chosen where the first does not convince
+    ├── choice.py        the policy: how many candidates are tried, and which is taken
+    ├── candidates.py    ways of mapping one database; pool.py maps several at a time
+    ├── views.py         a model's cameras and poses; epipolar.py and agreement.py compare two
+    ├── explained.py     the verified matches that a model explains
+    ├── predicted.py     the matches that a model predicts
+    ├── registration.py  photos in the wrong place, registered again
+    ├── folds/           models folded by repeated structure
+    ├── verdict.py       good, doubtful or wrong; record.py keeps why
+    ├── calibration.py   implausible focal lengths
+    └── failure.py       why there is no model
+"""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from corrsfm.reconstruction.best_model import Selection
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.explained import ExplainedPair
-from corrsfm.reconstruction.selection import Selection
 
 __all__ = ["FORMAT_VERSION", "record_of"]
 

@@ -19,9 +19,9 @@ from corrsfm.errors import ReconstructionError, first_few
 from corrsfm.files import atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
+from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.record import record_of
-from corrsfm.reconstruction.selection import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index

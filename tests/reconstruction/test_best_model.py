@@ -9,10 +9,10 @@ import pytest
 from synthetic_database import synthesize
 
 from corrsfm.colmap.pairs import read_verified_matches
-from corrsfm.reconstruction import selection
+from corrsfm.reconstruction import best_model
 from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.reconstruction.record import record_of
-from corrsfm.reconstruction.selection import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.reconstruction.verdict import Grade
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Features
@@ -72,7 +72,7 @@ def bent(truth: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
 def test_a_first_model_that_convinces_stays_and_nothing_else_is_mapped(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(selection.CandidatePool, "map", lambda *_: pytest.fail("mapped a candidate"))
+    monkeypatch.setattr(best_model.CandidatePool, "map", lambda *_: pytest.fail("mapped a candidate"))
     selected = scene.select(scene.truth)
     assert selected is not None and selected.model is scene.truth
     assert selected.verdict.grade is Grade.GOOD

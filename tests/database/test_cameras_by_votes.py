@@ -2,8 +2,8 @@
 
 import cv2  # noqa: F401
 
+from corrsfm.database.cameras_by_votes import assign_by_votes, cameras_that_vote
 from corrsfm.database.focal_votes import FocalGroup, FocalVotes, VoteDecision
-from corrsfm.database.shared_cameras import assign_by_votes, cameras_that_vote
 from corrsfm.types import Camera, ImageRecord
 
 LANDSCAPE = Camera(model="SIMPLE_RADIAL", width=640, height=480, params=(768.0, 320.0, 240.0, 0.0))
