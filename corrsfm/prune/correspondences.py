@@ -81,7 +81,7 @@ def correspondences_from_points(
     *,
     ratios: ArrayLike | None = None,
     mutual: ArrayLike | None = None,
-    name: str = "",
+    name: str = "your points",
 ) -> Correspondences:
     """Putative matches of your own, from any detector, for a prune method.
 
