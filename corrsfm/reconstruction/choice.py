@@ -13,12 +13,15 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 from corrsfm.reconstruction.agreement import agreement
-from corrsfm.reconstruction.explained import Explained
+from corrsfm.reconstruction.explained import ENOUGH_UNCONTRADICTED_SHARE, Explained
 from corrsfm.reconstruction.views import Views
 
 __all__ = ["Choice", "ChoicePolicy", "Tried", "choose_model", "good_enough"]
 
 C = TypeVar("C")
+
+SAME_MODEL = 0.99
+"""Share of relative poses that two models agree about if they are one and the same."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,13 +209,14 @@ def _why_stop(outcomes: Sequence[Tried | None], policy: ChoicePolicy) -> str:
     """Why no further candidate is needed; empty if one is."""
     tried = [model for model in outcomes if model is not None]
     best = _best(tried)
-    if (
-        len(tried) >= policy.min_models
-        and best.explained.is_enough(best.explained.share_of_supported)
-        and not best.explained.misplaced
-        and _support(best, tried, policy.confirming_predicted) >= policy.confirming_share
-    ):
-        return "another candidate confirmed the best"
+    support = _support(best, tried, policy.confirming_predicted)
+    share = best.explained.share_of_supported
+    if not best.explained.misplaced:
+        if len(tried) > policy.round_size and support >= SAME_MODEL and share >= ENOUGH_UNCONTRADICTED_SHARE:
+            return "another way of mapping gave the same model"
+        confirmed = best.explained.is_enough(share) and support >= policy.confirming_share
+        if len(tried) >= policy.min_models and confirmed:
+            return "another candidate confirmed the best"
     stood = len(outcomes) - 1 - outcomes.index(best)
     if stood >= policy.patience:
         return f"the best stood for {stood} candidates"

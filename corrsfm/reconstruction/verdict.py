@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import first_few
-from corrsfm.reconstruction.explained import Explained
+from corrsfm.reconstruction.choice import SAME_MODEL
+from corrsfm.reconstruction.explained import ENOUGH_UNCONTRADICTED_SHARE, Explained
 
 __all__ = ["Evidence", "Grade", "Verdict", "judge", "thickness"]
 
@@ -212,6 +213,9 @@ def _explained(evidence: Evidence) -> _Finding | None:
     explained = evidence.explained
     share = explained.share_of_supported
     if not explained.num_explained or explained.is_enough(share):
+        return None
+    # Two ways of mapping rarely bend a model alike; false matches of repeated texture explain the rest.
+    if (evidence.support or 0.0) >= SAME_MODEL and share >= ENOUGH_UNCONTRADICTED_SHARE:
         return None
     return _Finding(
         Grade.DOUBTFUL if share >= _WRONG_EXPLAINED else Grade.WRONG,

@@ -84,7 +84,7 @@ def test_the_right_model_is_chosen_among_bent_ones_and_confirmed_by_another_righ
     ]
     choice = choose(tried("a", BENT), bank)
     assert choice.chosen.name == "c"
-    assert choice.reason == "another candidate confirmed the best"
+    assert choice.reason == "another way of mapping gave the same model"
     assert [model.name for model in choice.tried] == ["a", "b", "c", "d", "e"]  # whole rounds
     assert choice.support == 1.0
     assert choice.chosen.num_predicted == 6 * 40
