@@ -136,9 +136,20 @@ def copy_database(source: Path, target: Path) -> None:
         Not changed; others may read it meanwhile.
     target : Path
         Must not exist.
+
+    Raises
+    ------
+    DatabaseError
+        If the source cannot be read or the target not written.
     """
-    with (
-        contextlib.closing(sqlite3.connect(source)) as old,
-        contextlib.closing(sqlite3.connect(target)) as new,
-    ):
-        old.backup(new)
+    try:
+        with (
+            contextlib.closing(sqlite3.connect(source, timeout=60)) as old,
+            contextlib.closing(sqlite3.connect(target)) as new,
+        ):
+            old.backup(new)
+    except sqlite3.Error as error:
+        raise DatabaseError(
+            f"{source}: cannot be copied to {target.parent} ({error}); check the free space of the disk and "
+            "close other programs that use the file"
+        ) from error

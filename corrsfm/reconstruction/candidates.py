@@ -159,21 +159,25 @@ def map_candidate(
     scratch = workdir / "mapper"
     scratch.mkdir(parents=True)
     started = time.monotonic()
-    with colmap_log(), database_errors(database):
+    # A copy for this process: several that open one database at the same moment get in each other's way.
+    own = workdir / "original.db"
+    copy_database(database, own)
+    with colmap_log(), database_errors(own, database):
         pycolmap.set_random_seed(candidate.seed)
-        prepared = _prepare_database(candidate, database, workdir, focal_lengths_px or {})
+        prepared = _prepare_database(candidate, own, workdir, focal_lengths_px or {})
         models = {} if prepared is None else _map(
             candidate, prepared, scratch, refine_principal_point, num_threads, max_runtime_seconds
         )  # fmt: skip
         model = max(models.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
         if model is not None and model.num_reg_images() > 1:
-            _restore_priors(model, database)
+            _restore_priors(model, own)
             (workdir / "model").mkdir()
             model.write_binary(workdir / "model")
         else:
             model = None
     shutil.rmtree(scratch)
-    (workdir / "database.db").unlink(missing_ok=True)
+    for name in ("database.db", "original.db"):
+        (workdir / name).unlink(missing_ok=True)
     # Last: its presence says that the candidate is finished.
     finished.write_text(json.dumps({"name": candidate.name, "seconds": time.monotonic() - started}))
     return model
