@@ -55,7 +55,9 @@ def two_worlds(path: Path, sizes: tuple[int, int]) -> None:
 
 
 def run(database: Path, output: Path, images_dir: Path | None = None, **options):
-    arguments = {key: options.pop(key) for key in ("seed", "on_progress", "log_file") if key in options}
+    arguments = {
+        key: options.pop(key) for key in ("seed", "num_threads", "on_progress", "log_file") if key in options
+    }
     return reconstruct(database, images_dir, output, config=ReconstructionConfig(**options), **arguments)
 
 
@@ -166,7 +168,7 @@ def test_few_verified_matches_are_enough_once_verified(tmp_path: Path) -> None:
 def test_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     synthesize(tmp_path / "database.db", inlier_match_ratio=0.8)
     for name in ("first", "second"):
-        run(tmp_path / "database.db", tmp_path / name, seed=3)
+        run(tmp_path / "database.db", tmp_path / name, seed=3, num_threads=1)
     for file in MODEL_FILES:
         assert (tmp_path / "first/0" / file).read_bytes() == (tmp_path / "second/0" / file).read_bytes(), file
 
