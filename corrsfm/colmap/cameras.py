@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,7 @@ __all__ = [
     "pinhole_parameters",
     "to_pycolmap",
     "with_focal_length",
+    "write_camera",
 ]
 
 
@@ -38,6 +40,19 @@ def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
         params=list(camera.params),
         has_prior_focal_length=camera.has_prior_focal_length,
     )
+
+
+def write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> int:
+    """Write a camera and the rig that COLMAP wants around it; the new id of both."""
+    import pycolmap
+
+    written = copy.copy(camera)
+    written.camera_id = database.write_camera(written)
+    rig = pycolmap.Rig()
+    rig.add_ref_sensor(written.sensor_id)
+    rig.rig_id = written.camera_id
+    database.write_rig(rig, use_rig_id=True)
+    return written.camera_id
 
 
 def camera_from_pycolmap(camera: pycolmap.Camera) -> Camera:

@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import to_pycolmap
+from corrsfm.colmap.cameras import to_pycolmap, write_camera
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import database_errors, is_sqlite
 from corrsfm.config import DatabaseConfig
@@ -111,7 +111,7 @@ def _fill(
     with pycolmap.Database.open(path) as database:
         transaction = pycolmap.DatabaseTransaction(database)
         try:
-            camera_ids = [_write_camera(database, camera) for camera in cameras]
+            camera_ids = [write_camera(database, to_pycolmap(camera)) for camera in cameras]
             num_keypoints: dict[str, int] = {}
             image_ids: dict[str, int] = {}
             for image in sorted(images, key=lambda image: image.name):
@@ -124,17 +124,6 @@ def _fill(
         finally:
             # The transaction ends when its object goes; the database must be open then.
             del transaction
-
-
-def _write_camera(database: pycolmap.Database, camera: Camera) -> int:
-    """Write a camera and the rig that COLMAP wants around it; its id."""
-    written = to_pycolmap(camera)
-    written.camera_id = database.write_camera(written)
-    rig = pycolmap.Rig()
-    rig.add_ref_sensor(written.sensor_id)
-    rig.rig_id = written.camera_id
-    database.write_rig(rig, use_rig_id=True)
-    return written.camera_id
 
 
 def _write_image(database: pycolmap.Database, image: ImageRecord, camera_id: int) -> int:

@@ -127,7 +127,7 @@ def select_model(
     policy: ChoicePolicy,
     first_seconds: float,
     seed: int = 0,
-    given_focal_lengths_px: Mapping[int, float] | None = None,
+    may_separate: bool = False,
     refine_principal_point: bool = False,
     num_processes: int = 1,
     unfold: bool = True,
@@ -152,8 +152,8 @@ def select_model(
         What mapping the first model took.
     seed : int
         Of the first model.
-    given_focal_lengths_px : mapping of int to float, optional
-        Focal lengths to try as well, by COLMAP's camera id; see `map_candidate`.
+    may_separate : bool
+        Try a camera for each photo as well where photos share one of unknown focal length.
     refine_principal_point : bool
     num_processes : int
         Candidates mapped at a time; the choice does not depend on it.
@@ -177,11 +177,10 @@ def select_model(
         views = views_of(model)
         return Tried(name=name, views=views, explained=evidence.explain(views), seconds=seconds)
 
-    bank = candidate_bank(seed=seed, have_given=bool(given_focal_lengths_px))
+    bank = candidate_bank(seed=seed, may_separate=may_separate)
     with CandidatePool(
         database,
         workdir,
-        focal_lengths_px=given_focal_lengths_px,
         refine_principal_point=refine_principal_point,
         num_processes=num_processes,
         max_runtime_seconds=round(policy.max_time_factor * first_seconds) + 1,

@@ -1,4 +1,4 @@
-"""A bank of candidate models: the mappers, thresholds and focal lengths worth trying on one database.
+"""A bank of candidate models: the mappers, thresholds and cameras worth trying on one database.
 
 No kind of candidate is best everywhere, and incremental mapping of a weak pair graph depends on its seed. So
 candidates differ in as many ways as the mapper allows, and are tried in the order of what they brought on
@@ -10,13 +10,13 @@ from __future__ import annotations
 import json
 import shutil
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
 import pycolmap
 
+from corrsfm.colmap.cameras import write_camera
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.errors import DatabaseError
@@ -24,11 +24,13 @@ from corrsfm.reconstruction.calibration import refine_intrinsics
 
 __all__ = [
     "Candidate",
-    "FocalLengths",
     "MapperKind",
+    "StartingCameras",
     "candidate_bank",
     "incremental_options",
     "map_candidate",
+    "separate_cameras",
+    "shares_unknown_camera",
 ]
 
 # What `relaxed` changes of COLMAP's defaults (100, 16°, 30, 0.25, 3): pairs of few matches and small
@@ -53,15 +55,15 @@ class MapperKind(StrEnum):
     GLOBAL = "global"
 
 
-class FocalLengths(StrEnum):
-    """Which focal lengths a candidate starts from."""
+class StartingCameras(StrEnum):
+    """Which cameras a candidate starts from."""
 
     AS_IS = "as-is"
     """Those of the database."""
     CALIBRATED = "calibrated"
     """Those of COLMAP's view graph calibration, which also computes the geometries of pairs again."""
-    GIVEN = "given"
-    """Those handed in, such as the plain guess where votes have set another."""
+    SEPARATE = "separate"
+    """Those of the database, but a copy for each photo where several share one of unknown focal length."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,39 +73,40 @@ class Candidate:
     Attributes
     ----------
     mapper : MapperKind
-    focal_lengths : FocalLengths
+    cameras : StartingCameras
     seed : int
         Equal candidates give equal models.
     """
 
     mapper: MapperKind
-    focal_lengths: FocalLengths = FocalLengths.AS_IS
+    cameras: StartingCameras = StartingCameras.AS_IS
     seed: int = 0
 
     @property
     def name(self) -> str:
-        """Short and unique within a bank, fit for a folder: ``relaxed-given-1``."""
-        return f"{self.mapper}-{self.focal_lengths}-{self.seed}"
+        """Short and unique within a bank, fit for a folder: ``relaxed-separate-1``."""
+        return f"{self.mapper}-{self.cameras}-{self.seed}"
 
 
-def candidate_bank(*, seed: int, have_given: bool, num_seeds: int = 3) -> list[Candidate]:
+def candidate_bank(*, seed: int, may_separate: bool, num_seeds: int = 3) -> list[Candidate]:
     """All candidates, in the order in which they are to be tried; the first model is not among them.
 
     Parameters
     ----------
     seed : int
         Of the first model; the others count up from it.
-    have_given : bool
-        Whether focal lengths are handed in to try as well.
+    may_separate : bool
+        Whether photos share a camera on no more evidence than their size.
     num_seeds : int
         How often each incremental kind is tried.
     """
-    sources = [FocalLengths.AS_IS, FocalLengths.CALIBRATED]
-    sources += [FocalLengths.GIVEN] if have_given else []
+    sources = [StartingCameras.AS_IS]
+    sources += [StartingCameras.SEPARATE] if may_separate else []
+    sources += [StartingCameras.CALIBRATED]
     # By how near the best of its bank each kind came, on average; calibration is also slow.
     kinds = [MapperKind.GLOBAL, MapperKind.RELAXED, MapperKind.HELD, MapperKind.INCREMENTAL]
     bank = [
-        Candidate(mapper=kind, focal_lengths=source, seed=seed + turn)
+        Candidate(mapper=kind, cameras=source, seed=seed + turn)
         for turn in range(num_seeds)
         for source in sources
         for kind in kinds
@@ -117,7 +120,6 @@ def map_candidate(
     database: Path,
     workdir: Path,
     *,
-    focal_lengths_px: Mapping[int, float] | None = None,
     refine_principal_point: bool = False,
     num_threads: int = 1,
     max_runtime_seconds: int = 0,
@@ -132,8 +134,6 @@ def map_candidate(
     workdir : Path
         Folder of this candidate alone. It keeps ``model/`` and ``candidate.json`` with the seconds it took;
         what an interrupted run left half finished is replaced.
-    focal_lengths_px : mapping of int to float, optional
-        COLMAP's camera id → focal length, for `FocalLengths.GIVEN`; other cameras stay as they are.
     refine_principal_point : bool
     num_threads : int
         With 1 the model is a function of database and candidate; with more, only up to rounding.
@@ -164,7 +164,7 @@ def map_candidate(
     copy_database(database, own)
     with colmap_log(), database_errors(own, database):
         pycolmap.set_random_seed(candidate.seed)
-        prepared = _prepare_database(candidate, own, workdir, focal_lengths_px or {})
+        prepared = _prepare_database(candidate, own, workdir)
         models = {} if prepared is None else _map(
             candidate, prepared, scratch, refine_principal_point, num_threads, max_runtime_seconds
         )  # fmt: skip
@@ -183,27 +183,48 @@ def map_candidate(
     return model
 
 
-def _prepare_database(
-    candidate: Candidate, database: Path, workdir: Path, focal_lengths_px: Mapping[int, float]
-) -> Path | None:
-    """The database with the candidate's focal lengths; None if they could not be had."""
-    if candidate.focal_lengths is FocalLengths.AS_IS:
+def _prepare_database(candidate: Candidate, database: Path, workdir: Path) -> Path | None:
+    """The database with the candidate's cameras; None if they could not be had."""
+    if candidate.cameras is StartingCameras.AS_IS:
         return database
     copy = workdir / "database.db"
     copy_database(database, copy)
-    if candidate.focal_lengths is FocalLengths.CALIBRATED:
+    if candidate.cameras is StartingCameras.CALIBRATED:
         options = pycolmap.ViewGraphCalibrationOptions()
         options.random_seed = candidate.seed
         return copy if pycolmap.calibrate_view_graph(copy, options) else None
-    with pycolmap.Database.open(copy) as tables:
-        for camera in tables.read_all_cameras():
-            if camera.camera_id in focal_lengths_px:
-                for index in camera.focal_length_idxs():
-                    camera.params[index] = focal_lengths_px[camera.camera_id]
-                # Otherwise the first photo of a camera is tried with other focal lengths, too.
-                camera.has_prior_focal_length = True
-                tables.update_camera(camera)
+    separate_cameras(copy)
     return copy
+
+
+def shares_unknown_camera(database: Path) -> bool:
+    """Whether photos share a camera whose focal length is not known."""
+    with colmap_log(), database_errors(database), pycolmap.Database.open(database) as tables:
+        unknown = {c.camera_id for c in tables.read_all_cameras() if not c.has_prior_focal_length}
+        sharing = [image.camera_id for image in tables.read_all_images() if image.camera_id in unknown]
+    return len(set(sharing)) < len(sharing)
+
+
+def separate_cameras(database: Path) -> None:
+    """Give every photo a camera of its own where photos share one whose focal length is not known.
+
+    The photo with the smallest id keeps the camera. Geometries of pairs stay as they are.
+    """
+    with pycolmap.Database.open(database) as tables:
+        cameras = {camera.camera_id: camera for camera in tables.read_all_cameras()}
+        frames = {image_id.id: frame for frame in tables.read_all_frames() for image_id in frame.image_ids}
+        taken: set[int] = set()
+        for image in sorted(tables.read_all_images(), key=lambda image: image.image_id):
+            camera = cameras[image.camera_id]
+            if camera.has_prior_focal_length or camera.camera_id not in taken:
+                taken.add(camera.camera_id)
+                continue
+            image.camera_id = write_camera(tables, camera)
+            frame = frames[image.image_id]
+            separate = pycolmap.Frame(frame_id=frame.frame_id, rig_id=image.camera_id)
+            separate.add_data_id(image.data_id)
+            tables.update_frame(separate)
+            tables.update_image(image)
 
 
 def _restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
@@ -211,7 +232,8 @@ def _restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
     with pycolmap.Database.open(database) as tables:
         has_prior = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
     for camera_id, camera in model.cameras.items():
-        camera.has_prior_focal_length = has_prior[camera_id]
+        # Only cameras of unknown focal length are separated.
+        camera.has_prior_focal_length = has_prior.get(camera_id, False)
 
 
 def _map(

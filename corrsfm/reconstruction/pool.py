@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import multiprocessing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -35,8 +35,6 @@ class CandidatePool:
         With verified two-view geometries; not changed.
     workdir : Path
         Every candidate gets a folder of its name here and is read from it if an earlier run finished it.
-    focal_lengths_px : mapping of int to float, optional
-        See `map_candidate`.
     refine_principal_point : bool
     num_processes : int
         1 maps in this process.
@@ -49,7 +47,6 @@ class CandidatePool:
         database: Path,
         workdir: Path,
         *,
-        focal_lengths_px: Mapping[int, float] | None = None,
         refine_principal_point: bool = False,
         num_processes: int = 1,
         max_runtime_seconds: int = 0,
@@ -57,7 +54,6 @@ class CandidatePool:
         self._database = database
         self._workdir = workdir
         self._options = {
-            "focal_lengths_px": dict(focal_lengths_px or {}),
             "refine_principal_point": refine_principal_point,
             "max_runtime_seconds": max_runtime_seconds,
         }

@@ -11,10 +11,12 @@ from synthetic_database import synthesize
 from corrsfm.reconstruction.agreement import agreement
 from corrsfm.reconstruction.candidates import (
     Candidate,
-    FocalLengths,
     MapperKind,
+    StartingCameras,
     candidate_bank,
     map_candidate,
+    separate_cameras,
+    shares_unknown_camera,
 )
 from corrsfm.reconstruction.views import views_of
 
@@ -31,15 +33,15 @@ def spoil_focal_length(path: Path, factor: float) -> float:
 
 
 def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
-    bank = candidate_bank(seed=5, have_given=True, num_seeds=2)
+    bank = candidate_bank(seed=5, may_separate=True, num_seeds=2)
     assert len(bank) == len({candidate.name for candidate in bank}) == 2 * 3 * 4 - 1
     assert Candidate(mapper=MapperKind.INCREMENTAL, seed=5) not in bank
     assert {candidate.seed for candidate in bank} == {5, 6}
 
 
-def test_a_bank_without_given_focal_lengths_asks_for_none() -> None:
-    bank = candidate_bank(seed=0, have_given=False)
-    assert not any(candidate.focal_lengths is FocalLengths.GIVEN for candidate in bank)
+def test_cameras_are_separated_only_where_they_are_on_trial() -> None:
+    bank = candidate_bank(seed=0, may_separate=False)
+    assert not any(candidate.cameras is StartingCameras.SEPARATE for candidate in bank)
     assert len(bank) == 3 * 2 * 4 - 1
 
 
@@ -53,16 +55,11 @@ def test_every_mapper_finds_the_true_model(tmp_path: Path, mapper: MapperKind) -
     assert sorted(path.name for path in (tmp_path / "candidate").iterdir()) == ["candidate.json", "model"]
 
 
-@pytest.mark.parametrize("focal_lengths", [FocalLengths.GIVEN, FocalLengths.CALIBRATED])
-def test_focal_lengths_are_given_to_the_candidate_and_not_to_the_database(
-    tmp_path: Path, focal_lengths: FocalLengths
-) -> None:
+def test_what_a_candidate_calibrates_stays_its_own(tmp_path: Path) -> None:
     truth = synthesize(tmp_path / "database.db")
     true = spoil_focal_length(tmp_path / "database.db", 1.2)
-    candidate = Candidate(mapper=MapperKind.HELD, focal_lengths=focal_lengths)
-    model = map_candidate(
-        candidate, tmp_path / "database.db", tmp_path / "candidate", focal_lengths_px={1: true}
-    )
+    candidate = Candidate(mapper=MapperKind.HELD, cameras=StartingCameras.CALIBRATED)
+    model = map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate")
     assert model is not None
     assert agreement(views_of(truth), views_of(model)).share == 1.0
     assert model.cameras[1].mean_focal_length() == pytest.approx(true, rel=0.02)
@@ -71,6 +68,30 @@ def test_focal_lengths_are_given_to_the_candidate_and_not_to_the_database(
         (camera,) = database.read_all_cameras()
     assert camera.mean_focal_length() == pytest.approx(1.2 * true)
     assert not camera.has_prior_focal_length
+
+
+@pytest.mark.parametrize("mapper", list(MapperKind))
+def test_photos_of_a_shared_camera_get_one_each(tmp_path: Path, mapper: MapperKind) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    assert shares_unknown_camera(tmp_path / "database.db")
+    candidate = Candidate(mapper=mapper, cameras=StartingCameras.SEPARATE)
+    model = map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate")
+    assert model is not None and agreement(views_of(truth), views_of(model)).share == 1.0
+    assert len({image.camera_id for image in model.images.values()}) == model.num_reg_images() == 8
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        assert database.num_cameras() == 1
+
+
+def test_a_camera_of_known_focal_length_is_not_separated(tmp_path: Path) -> None:
+    synthesize(tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        (camera,) = database.read_all_cameras()
+        camera.has_prior_focal_length = True
+        database.update_camera(camera)
+    assert not shares_unknown_camera(tmp_path / "database.db")
+    separate_cameras(tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        assert (database.num_cameras(), database.num_rigs()) == (1, 1)
 
 
 def test_equal_candidates_give_equal_models(tmp_path: Path) -> None:
@@ -107,13 +128,13 @@ def test_what_an_interrupted_run_left_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapper", list(MapperKind))
-@pytest.mark.parametrize("focal_lengths", list(FocalLengths))
+@pytest.mark.parametrize("cameras", list(StartingCameras))
 def test_a_database_without_pairs_gives_no_model(
-    tmp_path: Path, mapper: MapperKind, focal_lengths: FocalLengths
+    tmp_path: Path, mapper: MapperKind, cameras: StartingCameras
 ) -> None:
     synthesize(tmp_path / "database.db")
     with pycolmap.Database.open(tmp_path / "database.db") as database:
         database.clear_two_view_geometries()
-    candidate = Candidate(mapper=mapper, focal_lengths=focal_lengths)
+    candidate = Candidate(mapper=mapper, cameras=cameras)
     for _ in range(2):  # the second time it is read
         assert map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate") is None
