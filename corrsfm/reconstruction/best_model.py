@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,9 +16,16 @@ from numpy.typing import NDArray
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.reconstruction.calibration import describe_impossible, has_prior_focal_lengths
-from corrsfm.reconstruction.candidates import Candidate, MapperKind, candidate_bank, map_candidate
+from corrsfm.reconstruction.candidates import (
+    Candidate,
+    MapperKind,
+    StartingCameras,
+    candidate_bank,
+    map_candidate,
+)
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
 from corrsfm.reconstruction.explained import Explained, explain
+from corrsfm.reconstruction.focal_slack import FocalSlack, measure_focal_slack
 from corrsfm.reconstruction.folds.evidence import FoldEvidence
 from corrsfm.reconstruction.folds.unfold import (
     Attempt,
@@ -127,7 +135,7 @@ def select_model(
     policy: ChoicePolicy,
     first_seconds: float,
     seed: int = 0,
-    may_separate: bool = False,
+    cameras_on_trial: StartingCameras | None = None,
     refine_principal_point: bool = False,
     num_processes: int = 1,
     unfold: bool = True,
@@ -152,8 +160,8 @@ def select_model(
         What mapping the first model took.
     seed : int
         Of the first model.
-    may_separate : bool
-        Try a camera for each photo as well where photos share one of unknown focal length.
+    cameras_on_trial : StartingCameras, optional
+        Other cameras to try as well, see `corrsfm.reconstruction.candidates.find_cameras_on_trial`.
     refine_principal_point : bool
     num_processes : int
         Candidates mapped at a time; the choice does not depend on it.
@@ -177,7 +185,7 @@ def select_model(
         views = views_of(model)
         return Tried(name=name, views=views, explained=evidence.explain(views), seconds=seconds)
 
-    bank = candidate_bank(seed=seed, may_separate=may_separate)
+    bank = candidate_bank(seed=seed, on_trial=cameras_on_trial)
     with CandidatePool(
         database,
         workdir,
@@ -204,7 +212,11 @@ def select_model(
             )
             return None if again is None else tried(model.name + _MENDED, again, first_seconds)
 
-        start = None if first is None else tried(FIRST, first, first_seconds)
+        start = None
+        if first is not None:
+            slack = _focal_slack(first)
+            is_open = slack is not None and slack.is_large
+            start = dataclasses.replace(tried(FIRST, first, first_seconds), is_open=is_open)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
             start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)
@@ -287,6 +299,11 @@ def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first
     )
 
 
+def _focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
+    """What other focal lengths would change; None where none is open."""
+    return None if has_prior_focal_lengths(model) else measure_focal_slack(model)
+
+
 def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, folds: FoldEvidence) -> Verdict:
     points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
     return judge(
@@ -296,6 +313,7 @@ def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, fo
             support=choice.support,
             implausible_intrinsics=describe_impossible(model),
             has_prior_focal_lengths=has_prior_focal_lengths(model),
+            focal_slack=_focal_slack(model),
             thickness=thickness(points),
             is_folded=folds.folded,
             conflicts=[f"{pair.name0} – {pair.name1}" for pair in folds.worst(3)] if folds.folded else (),

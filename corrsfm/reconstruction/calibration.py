@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 __all__ = [
     "describe_impossible",
     "focal_length_ratios",
+    "has_possible_cameras",
     "has_prior_focal_lengths",
     "is_plausible",
     "refine_intrinsics",
@@ -61,6 +62,18 @@ def is_plausible(model: pycolmap.Reconstruction) -> bool:
         return False
     factors = np.exp(np.abs(np.log(ratios / np.median(ratios))))
     return bool(np.mean(factors > _LARGEST_FACTOR) <= _LARGEST_SHARE)
+
+
+def has_possible_cameras(model: pycolmap.Reconstruction) -> bool:
+    """Whether all cameras of registered photos have finite parameters and focal lengths above zero.
+
+    Bundle adjustment knows no bounds: on a few false matches a focal length can pass through zero.
+    """
+    cameras = [image.camera for image in model.images.values() if image.has_pose]
+    return all(
+        np.isfinite(camera.params).all() and (camera.params[list(camera.focal_length_idxs())] > 0).all()
+        for camera in cameras
+    )
 
 
 def describe_impossible(model: pycolmap.Reconstruction) -> str:

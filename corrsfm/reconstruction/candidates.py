@@ -10,6 +10,8 @@ from __future__ import annotations
 import json
 import shutil
 import time
+from collections import Counter
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -20,17 +22,17 @@ from corrsfm.colmap.cameras import write_camera
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.errors import DatabaseError
-from corrsfm.reconstruction.calibration import refine_intrinsics
+from corrsfm.reconstruction.calibration import has_possible_cameras, refine_intrinsics
 
 __all__ = [
     "Candidate",
     "MapperKind",
     "StartingCameras",
     "candidate_bank",
+    "change_cameras",
+    "find_cameras_on_trial",
     "incremental_options",
     "map_candidate",
-    "separate_cameras",
-    "shares_unknown_camera",
 ]
 
 # What `relaxed` changes of COLMAP's defaults (100, 16°, 30, 0.25, 3): pairs of few matches and small
@@ -64,6 +66,8 @@ class StartingCameras(StrEnum):
     """Those of COLMAP's view graph calibration, which also computes the geometries of pairs again."""
     SEPARATE = "separate"
     """Those of the database, but a copy for each photo where several share one of unknown focal length."""
+    SHARED = "shared"
+    """Those of the database, but one for all photos of a size whose focal lengths are unknown."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,20 +92,20 @@ class Candidate:
         return f"{self.mapper}-{self.cameras}-{self.seed}"
 
 
-def candidate_bank(*, seed: int, may_separate: bool, num_seeds: int = 3) -> list[Candidate]:
+def candidate_bank(*, seed: int, on_trial: StartingCameras | None, num_seeds: int = 3) -> list[Candidate]:
     """All candidates, in the order in which they are to be tried; the first model is not among them.
 
     Parameters
     ----------
     seed : int
         Of the first model; the others count up from it.
-    may_separate : bool
-        Whether photos share a camera on no more evidence than their size.
+    on_trial : StartingCameras or None
+        Other cameras to try as well, see `find_cameras_on_trial`.
     num_seeds : int
         How often each incremental kind is tried.
     """
     sources = [StartingCameras.AS_IS]
-    sources += [StartingCameras.SEPARATE] if may_separate else []
+    sources += [on_trial] if on_trial else []
     sources += [StartingCameras.CALIBRATED]
     # By how near the best of its bank each kind came, on average; calibration is also slow.
     kinds = [MapperKind.GLOBAL, MapperKind.RELAXED, MapperKind.HELD, MapperKind.INCREMENTAL]
@@ -168,7 +172,8 @@ def map_candidate(
         models = {} if prepared is None else _map(
             candidate, prepared, scratch, refine_principal_point, num_threads, max_runtime_seconds
         )  # fmt: skip
-        model = max(models.values(), key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
+        possible = [one for one in models.values() if has_possible_cameras(one)]
+        model = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
         if model is not None and model.num_reg_images() > 1:
             _restore_priors(model, own)
             (workdir / "model").mkdir()
@@ -193,37 +198,69 @@ def _prepare_database(candidate: Candidate, database: Path, workdir: Path) -> Pa
         options = pycolmap.ViewGraphCalibrationOptions()
         options.random_seed = candidate.seed
         return copy if pycolmap.calibrate_view_graph(copy, options) else None
-    separate_cameras(copy)
+    change_cameras(copy, candidate.cameras)
     return copy
 
 
-def shares_unknown_camera(database: Path) -> bool:
-    """Whether photos share a camera whose focal length is not known."""
+def find_cameras_on_trial(database: Path) -> StartingCameras | None:
+    """The other way to give photos of unknown focal length their cameras, where nothing decided for one.
+
+    Returns
+    -------
+    StartingCameras or None
+        `SEPARATE` if some share a camera, else `SHARED` if some of one size have a camera each, else None.
+    """
     with colmap_log(), database_errors(database), pycolmap.Database.open(database) as tables:
-        unknown = {c.camera_id for c in tables.read_all_cameras() if not c.has_prior_focal_length}
-        sharing = [image.camera_id for image in tables.read_all_images() if image.camera_id in unknown]
-    return len(set(sharing)) < len(sharing)
+        cameras = {camera.camera_id: camera for camera in tables.read_all_cameras()}
+        unknown = [
+            cameras[image.camera_id]
+            for image in tables.read_all_images()
+            if not cameras[image.camera_id].has_prior_focal_length
+        ]
+    if _has_twice(camera.camera_id for camera in unknown):
+        return StartingCameras.SEPARATE
+    if _has_twice((camera.width, camera.height) for camera in unknown):
+        return StartingCameras.SHARED
+    return None
 
 
-def separate_cameras(database: Path) -> None:
-    """Give every photo a camera of its own where photos share one whose focal length is not known.
+def _has_twice(values: Iterable[Hashable]) -> bool:
+    return any(count > 1 for count in Counter(values).values())
 
-    The photo with the smallest id keeps the camera. Geometries of pairs stay as they are.
+
+def change_cameras(database: Path, to: StartingCameras) -> None:
+    """Separate the cameras of photos in a database, or have photos share them; geometries of pairs stay.
+
+    Parameters
+    ----------
+    database : Path
+        Changed in place.
+    to : StartingCameras
+        `SEPARATE` or `SHARED`. Cameras of known focal length stay.
     """
     with pycolmap.Database.open(database) as tables:
         cameras = {camera.camera_id: camera for camera in tables.read_all_cameras()}
-        frames = {image_id.id: frame for frame in tables.read_all_frames() for image_id in frame.image_ids}
+        frame_of = {data.id: frame for frame in tables.read_all_frames() for data in frame.image_ids}
+        first_of_size: dict[tuple[int, int], int] = {}
         taken: set[int] = set()
         for image in sorted(tables.read_all_images(), key=lambda image: image.image_id):
             camera = cameras[image.camera_id]
-            if camera.has_prior_focal_length or camera.camera_id not in taken:
-                taken.add(camera.camera_id)
+            if camera.has_prior_focal_length:
                 continue
-            image.camera_id = write_camera(tables, camera)
-            frame = frames[image.image_id]
-            separate = pycolmap.Frame(frame_id=frame.frame_id, rig_id=image.camera_id)
-            separate.add_data_id(image.data_id)
-            tables.update_frame(separate)
+            if to is StartingCameras.SHARED:
+                camera_id = first_of_size.setdefault((camera.width, camera.height), camera.camera_id)
+            else:
+                camera_id = (
+                    camera.camera_id if camera.camera_id not in taken else write_camera(tables, camera)
+                )
+                taken.add(camera_id)
+            if camera_id == image.camera_id:
+                continue
+            image.camera_id = camera_id
+            # The rig around a camera has its id, see `write_camera`.
+            frame = pycolmap.Frame(frame_id=frame_of[image.image_id].frame_id, rig_id=camera_id)
+            frame.add_data_id(image.data_id)
+            tables.update_frame(frame)
             tables.update_image(image)
 
 
@@ -232,7 +269,7 @@ def _restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
     with pycolmap.Database.open(database) as tables:
         has_prior = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
     for camera_id, camera in model.cameras.items():
-        # Only cameras of unknown focal length are separated.
+        # Only cameras of unknown focal length are copied.
         camera.has_prior_focal_length = has_prior.get(camera_id, False)
 
 

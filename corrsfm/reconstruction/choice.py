@@ -73,6 +73,8 @@ class Tried:
     explained : Explained
     seconds : float
         Of the mapping.
+    is_open : bool
+        Its poses hang on a focal length that the photos leave open, as far as that is known.
     num_predicted : int or None
         None until a choice has to be made.
     """
@@ -81,6 +83,7 @@ class Tried:
     views: Views
     explained: Explained
     seconds: float
+    is_open: bool = False
     num_predicted: int | None = None
 
     @property
@@ -121,9 +124,10 @@ class Choice:
 
 
 def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
-    """Whether a first model needs no second: it explains enough, holds the photos, and misplaces none."""
+    """Whether a first model needs no second: it explains enough, fixes the photos, misplaces none."""
     return (
-        not model.explained.misplaced
+        not model.is_open
+        and not model.explained.misplaced
         and model.explained.is_enough(model.explained_share)
         and model.num_registered >= policy.min_registered_share * num_photos
     )

@@ -19,7 +19,7 @@ from corrsfm.colmap.sqlite import database_errors
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError
 from corrsfm.files import atomic_path
-from corrsfm.reconstruction.calibration import is_plausible, refine_intrinsics
+from corrsfm.reconstruction.calibration import has_possible_cameras, is_plausible, refine_intrinsics
 from corrsfm.reconstruction.failure import read_pair_graph, why_no_model
 from corrsfm.types import ModelSummary
 
@@ -302,7 +302,8 @@ def _ranked(models: Iterable[pycolmap.Reconstruction], min_model_size: int) -> l
     def rank(model: pycolmap.Reconstruction) -> tuple[int, int, str]:
         return -model.num_reg_images(), -model.num_points3D(), _first_name(model)
 
-    ranked = sorted((model for model in models if model.num_reg_images() > 1), key=rank)
+    usable = (model for model in models if model.num_reg_images() > 1 and has_possible_cameras(model))
+    ranked = sorted(usable, key=rank)
     kept = ranked[:1]
     for model in ranked[1:]:
         # The mappers sometimes ignore their option of this name.

@@ -20,7 +20,7 @@ from corrsfm.files import atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
-from corrsfm.reconstruction.candidates import shares_unknown_camera
+from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.record import record_of
 from corrsfm.workspace import Workspace
@@ -129,7 +129,7 @@ class _Choice:
                 policy=policy_for(self._config.max_models_tried, seconds),
                 first_seconds=seconds,
                 seed=run.seed,
-                may_separate=self._shares_on_trial(),
+                cameras_on_trial=self._cameras_on_trial(),
                 refine_principal_point=self._config.refine_principal_point,
                 num_processes=count_threads(run.threads),
                 unfold=self._config.unfold,
@@ -148,11 +148,11 @@ class _Choice:
         logger.info("verdict: %s", self.selection.verdict)
         return self.selection.model
 
-    def _shares_on_trial(self) -> bool:
-        """Whether photos share a camera that neither the user, EXIF nor the votes of pairs gave them."""
+    def _cameras_on_trial(self) -> StartingCameras | None:
+        """Other cameras to try; none where the user said which photos share one."""
         if self._workspace.require("images").config["camera_mode"] != cfg.CameraMode.AUTO:
-            return False
-        return shares_unknown_camera(self._workspace.database)
+            return None
+        return find_cameras_on_trial(self._workspace.database)
 
 
 def _show_progress(bar: tqdm, num_registered: int) -> None:

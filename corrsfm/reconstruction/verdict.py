@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from corrsfm.errors import first_few
 from corrsfm.reconstruction.choice import SAME_MODEL
 from corrsfm.reconstruction.explained import ENOUGH_UNCONTRADICTED_SHARE, Explained
+from corrsfm.reconstruction.focal_slack import FocalSlack
 
 __all__ = ["Evidence", "Grade", "Verdict", "judge", "thickness"]
 
@@ -80,7 +81,9 @@ class Evidence:
         What no camera can have, such as "focal lengths from 0.02 to 0.9 times the longest side"; empty if
         all are plausible.
     has_prior_focal_lengths : bool
-        All focal lengths come from EXIF or the user.
+        All focal lengths come from EXIF, the user or the votes of pairs.
+    focal_slack : FocalSlack or None
+        How far the poses hang on the focal length; None if it was not open or nothing could be measured.
     thickness : float or None
         Smallest over largest extent of the points (`thickness`); None if there are too few.
     is_folded : bool or None
@@ -94,6 +97,7 @@ class Evidence:
     support: float | None = None
     implausible_intrinsics: str = ""
     has_prior_focal_lengths: bool = False
+    focal_slack: FocalSlack | None = None
     thickness: float | None = None
     is_folded: bool | None = None
     conflicts: Sequence[str] = ()
@@ -303,6 +307,18 @@ def _plane(evidence: Evidence) -> _Finding | None:
     )
 
 
+def _focal_slack(evidence: Evidence) -> _Finding | None:
+    slack = evidence.focal_slack
+    if slack is None or not slack.is_large:
+        return None
+    return _Finding(
+        Grade.DOUBTFUL,
+        f"the photos leave the focal length open: one that is {100 * (slack.factor - 1):.0f} % longer or "
+        f"shorter fits nearly as well and moves the cameras by {slack.pose_change_deg:.1f}°",
+        "--camera-params with a calibrated focal length, or photos at other distances and heights",
+    )
+
+
 def _percent(share: float) -> str:
     # Rounded down: 99.97 % is not everything.
     return f"{math.floor(1000 * share) / 10:g} %"
@@ -320,4 +336,5 @@ _CHECKS: tuple[Callable[[Evidence], _Finding | None], ...] = (
     _loose_ends,
     _motion,
     _plane,
+    _focal_slack,
 )

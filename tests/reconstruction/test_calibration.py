@@ -1,6 +1,7 @@
 """Focal lengths that cannot be, and mapping that holds them at first."""
 
 import logging
+import math
 from pathlib import Path
 
 import pycolmap
@@ -13,6 +14,7 @@ from corrsfm.reconstruction import mapper as reconstruction
 from corrsfm.reconstruction.calibration import (
     describe_impossible,
     focal_length_ratios,
+    has_possible_cameras,
     has_prior_focal_lengths,
     is_plausible,
     refine_intrinsics,
@@ -63,6 +65,16 @@ def test_two_lenses_are_plausible_but_not_many_different_focal_lengths(
     assert is_plausible(model)
     set_focal_length(model, 2, 3.0)
     assert not is_plausible(model)
+
+
+@pytest.mark.parametrize("factor", [-1.0, 0.0, math.nan, math.inf])
+def test_a_model_whose_focal_length_left_the_positive_numbers_is_none(
+    model: pycolmap.Reconstruction, factor: float
+) -> None:
+    assert has_possible_cameras(model)
+    set_focal_length(model, 3, factor)
+    assert not has_possible_cameras(model)
+    assert reconstruction._ranked([model], 3) == []
 
 
 def test_known_focal_lengths_are_believed(model: pycolmap.Reconstruction) -> None:

@@ -14,9 +14,9 @@ from corrsfm.reconstruction.candidates import (
     MapperKind,
     StartingCameras,
     candidate_bank,
+    change_cameras,
+    find_cameras_on_trial,
     map_candidate,
-    separate_cameras,
-    shares_unknown_camera,
 )
 from corrsfm.reconstruction.views import views_of
 
@@ -33,15 +33,15 @@ def spoil_focal_length(path: Path, factor: float) -> float:
 
 
 def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
-    bank = candidate_bank(seed=5, may_separate=True, num_seeds=2)
+    bank = candidate_bank(seed=5, on_trial=StartingCameras.SEPARATE, num_seeds=2)
     assert len(bank) == len({candidate.name for candidate in bank}) == 2 * 3 * 4 - 1
     assert Candidate(mapper=MapperKind.INCREMENTAL, seed=5) not in bank
     assert {candidate.seed for candidate in bank} == {5, 6}
 
 
-def test_cameras_are_separated_only_where_they_are_on_trial() -> None:
-    bank = candidate_bank(seed=0, may_separate=False)
-    assert not any(candidate.cameras is StartingCameras.SEPARATE for candidate in bank)
+def test_other_cameras_are_tried_only_where_they_are_on_trial() -> None:
+    bank = candidate_bank(seed=0, on_trial=None)
+    assert {candidate.cameras for candidate in bank} == {StartingCameras.AS_IS, StartingCameras.CALIBRATED}
     assert len(bank) == 3 * 2 * 4 - 1
 
 
@@ -71,27 +71,40 @@ def test_what_a_candidate_calibrates_stays_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mapper", list(MapperKind))
-def test_photos_of_a_shared_camera_get_one_each(tmp_path: Path, mapper: MapperKind) -> None:
-    truth = synthesize(tmp_path / "database.db")
-    assert shares_unknown_camera(tmp_path / "database.db")
-    candidate = Candidate(mapper=mapper, cameras=StartingCameras.SEPARATE)
-    model = map_candidate(candidate, tmp_path / "database.db", tmp_path / "candidate")
-    assert model is not None and agreement(views_of(truth), views_of(model)).share == 1.0
-    assert len({image.camera_id for image in model.images.values()}) == model.num_reg_images() == 8
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
+def test_photos_of_a_shared_camera_get_one_each_and_share_one_again(
+    tmp_path: Path, mapper: MapperKind
+) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path)
+    assert find_cameras_on_trial(path) is StartingCameras.SEPARATE
+    separate = map_candidate(
+        Candidate(mapper=mapper, cameras=StartingCameras.SEPARATE), path, tmp_path / "separate"
+    )
+    assert separate is not None and agreement(views_of(truth), views_of(separate)).share == 1.0
+    assert len({image.camera_id for image in separate.images.values()}) == separate.num_reg_images() == 8
+    with pycolmap.Database.open(path) as database:
         assert database.num_cameras() == 1
+    change_cameras(path, StartingCameras.SEPARATE)
+    assert find_cameras_on_trial(path) is StartingCameras.SHARED
+    shared = map_candidate(
+        Candidate(mapper=mapper, cameras=StartingCameras.SHARED), path, tmp_path / "shared"
+    )
+    assert shared is not None and agreement(views_of(truth), views_of(shared)).share == 1.0
+    assert {image.camera_id for image in shared.images.values()} == {1}
 
 
-def test_a_camera_of_known_focal_length_is_not_separated(tmp_path: Path) -> None:
-    synthesize(tmp_path / "database.db")
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
+def test_cameras_of_known_focal_length_are_not_on_trial(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    synthesize(path)
+    with pycolmap.Database.open(path) as database:
         (camera,) = database.read_all_cameras()
         camera.has_prior_focal_length = True
         database.update_camera(camera)
-    assert not shares_unknown_camera(tmp_path / "database.db")
-    separate_cameras(tmp_path / "database.db")
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
-        assert (database.num_cameras(), database.num_rigs()) == (1, 1)
+    assert find_cameras_on_trial(path) is None
+    for to in (StartingCameras.SEPARATE, StartingCameras.SHARED):
+        change_cameras(path, to)
+        with pycolmap.Database.open(path) as database:
+            assert (database.num_cameras(), database.num_rigs()) == (1, 1)
 
 
 def test_equal_candidates_give_equal_models(tmp_path: Path) -> None:

@@ -48,6 +48,10 @@ def test_a_first_model_that_misses_a_photo_is_not_good_enough() -> None:
     assert not good_enough(tried("first", RIGHT), 5, POLICY)
 
 
+def test_a_first_model_of_open_focal_length_is_not_good_enough() -> None:
+    assert not good_enough(dataclasses.replace(tried("first", RIGHT), is_open=True), 4, POLICY)
+
+
 def test_a_first_model_with_a_misplaced_photo_is_not_good_enough() -> None:
     right, bent = tried("first", RIGHT), tried("first", BENT)
     assert good_enough(right, 4, POLICY)

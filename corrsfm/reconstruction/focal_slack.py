@@ -1,0 +1,121 @@
+"""How far the poses of a model hang on a focal length that its photos leave open.
+
+Photos around an object, or from one height over flat ground, fit many focal lengths: a change of the focal
+length is made good by moving the cameras and bending the points. Such a model explains every match, and its
+covariance is small, for the errors that remain are of the lens and not of the points. So the focal length is
+changed outright, everything else adjusted to it, and what that costs compared with what it moves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from corrsfm.reconstruction.agreement import relative_pose_differences_deg
+from corrsfm.reconstruction.views import views_of
+
+__all__ = ["FocalSlack", "measure_focal_slack"]
+
+# Right models of training and validation scenes have 1.07 and 0.77° at most, but for one.
+_LARGEST_FACTOR, _LARGEST_POSE_CHANGE_DEG = 1.08, 0.85
+
+_FACTOR = 1.18
+# A rise of the squared reprojection errors that the lens model alone may account for; and the smallest one
+# from which it is extrapolated.
+_TOLERATED_RISE, _SMALLEST_RISE = 0.05, 0.01
+_MAX_ITERATIONS = 20
+# More points do not change the ratio of two costs, but take time.
+_NUM_POINTS, _NUM_POINTS_PER_PHOTO = 1000, 40
+_MIN_NUM_POINTS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class FocalSlack:
+    """What another focal length would change.
+
+    Attributes
+    ----------
+    factor : float
+        By how much the focal lengths may be multiplied or divided for the squared reprojection errors to rise
+        by 5 %.
+    pose_change_deg : float
+        Median change of the relative poses by that, see
+        `corrsfm.reconstruction.agreement.relative_pose_differences_deg`.
+    """
+
+    factor: float
+    pose_change_deg: float
+
+    @property
+    def is_large(self) -> bool:
+        """Whether more than one focal length fits, and poses should not be relied on."""
+        return self.factor > _LARGEST_FACTOR or self.pose_change_deg > _LARGEST_POSE_CHANGE_DEG
+
+
+def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
+    """Change the focal lengths of a model by 18 %, both ways, and see what it costs and what it moves.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        Not changed.
+
+    Returns
+    -------
+    FocalSlack or None
+        The larger of both ways. None if the model has fewer than three photos or twenty points, or if nothing
+        could be adjusted.
+    """
+    if model.num_reg_images() < 3 or model.num_points3D() < _MIN_NUM_POINTS:
+        return None
+    base = _thinned(model)
+    cost = _adjust(base, refine_focal_length=True)
+    if cost is None or cost <= 0:
+        return None
+    views = views_of(base)
+    found = []
+    for factor in (_FACTOR, 1 / _FACTOR):
+        other = pycolmap.Reconstruction(base)
+        for camera in other.cameras.values():
+            params = camera.params.copy()
+            params[list(camera.focal_length_idxs())] *= factor
+            camera.params = params
+        other_cost = _adjust(other, refine_focal_length=False)
+        if other_cost is None:
+            continue
+        # Near the best focal length, costs rise with the square of the change and poses change in proportion.
+        share = np.sqrt(_TOLERATED_RISE / max(other_cost / cost - 1, _SMALLEST_RISE))
+        change_deg = float(np.median(relative_pose_differences_deg(views, views_of(other))))
+        found.append(FocalSlack(factor=float(_FACTOR**share), pose_change_deg=float(share * change_deg)))
+    return max(found, key=lambda slack: slack.pose_change_deg, default=None)
+
+
+def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy with a sample of the points, those of many photos first."""
+    copy = pycolmap.Reconstruction(model)
+    num_kept = max(_NUM_POINTS, _NUM_POINTS_PER_PHOTO * model.num_reg_images())
+    lengths = {point_id: point.track.length() for point_id, point in model.points3D.items()}
+    for point_id in sorted(lengths, key=lambda point_id: (-lengths[point_id], point_id))[num_kept:]:
+        copy.delete_point3D(point_id)
+    return copy
+
+
+def _adjust(model: pycolmap.Reconstruction, *, refine_focal_length: bool) -> float | None:
+    """Adjust a model in place; its cost, None if there is nothing to adjust."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = refine_focal_length
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.solver_options.max_num_iterations = _MAX_ITERATIONS
+    problem = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        problem.add_image(image_id)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, problem, model)
+    summary = adjuster.solve()
+    if not summary.is_solution_usable():
+        return None
+    # The type stubs know the base class of summaries only.
+    return float(summary.ceres_summary.final_cost)  # type: ignore[attr-defined]
