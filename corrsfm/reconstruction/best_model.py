@@ -183,7 +183,13 @@ def select_model(
     def tried(name: str, model: pycolmap.Reconstruction, seconds: float) -> Tried:
         models[name] = model
         views = views_of(model)
-        return Tried(name=name, views=views, explained=evidence.explain(views), seconds=seconds)
+        return Tried(
+            name=name,
+            views=views,
+            explained=evidence.explain(views),
+            seconds=seconds,
+            has_more_cameras=f"-{StartingCameras.SEPARATE}-" in name,
+        )
 
     bank = candidate_bank(seed=seed, on_trial=cameras_on_trial)
     with CandidatePool(
@@ -214,9 +220,11 @@ def select_model(
 
         start = None
         if first is not None:
+            start = tried(FIRST, first, first_seconds)
             slack = _focal_slack(first)
-            is_open = slack is not None and slack.is_large
-            start = dataclasses.replace(tried(FIRST, first, first_seconds), is_open=is_open)
+            # Fewer focal lengths may be found where many are open; the other candidates leave them as open.
+            if slack is not None and slack.is_large and cameras_on_trial is StartingCameras.SHARED:
+                start = dataclasses.replace(start, is_open=True)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
             start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)

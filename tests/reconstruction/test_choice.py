@@ -52,6 +52,20 @@ def test_a_first_model_of_open_focal_length_is_not_good_enough() -> None:
     assert not good_enough(dataclasses.replace(tried("first", RIGHT), is_open=True), 4, POLICY)
 
 
+@pytest.mark.parametrize(("num_predicted", "chosen"), [(1020, "first"), (1100, "separate")])
+def test_a_model_with_more_cameras_must_predict_clearly_more(num_predicted: int, chosen: str) -> None:
+    separate = dataclasses.replace(tried("separate", BENT_OTHERWISE), has_more_cameras=True)
+    choice = choose_model(
+        tried("first", BENT),
+        [separate],
+        num_photos=4,
+        map_round=lambda round_: round_,
+        count_predicted=lambda views: num_predicted if views is separate.views else 1000,
+        policy=POLICY,
+    )
+    assert choice.chosen.name == chosen
+
+
 def test_a_first_model_with_a_misplaced_photo_is_not_good_enough() -> None:
     right, bent = tried("first", RIGHT), tried("first", BENT)
     assert good_enough(right, 4, POLICY)
