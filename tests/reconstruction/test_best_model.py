@@ -125,7 +125,7 @@ def test_candidates_of_an_interrupted_choice_are_not_mapped_again(
 def test_the_record_is_plain_and_tells_the_choice(scene: Scene) -> None:
     selected = scene.select(bent(scene.truth))
     assert selected is not None
-    record = json.loads(json.dumps(record_of(selected), allow_nan=False))
+    record = json.loads(json.dumps(record_of(selected, scene.evidence), allow_nan=False))
     assert record["verdict"]["grade"] == str(selected.verdict.grade)
     assert [model["chosen"] for model in record["models_tried"]].count(True) == 1
     assert record["num_predicted_matches"] == selected.choice.chosen.num_predicted
