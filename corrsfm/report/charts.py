@@ -126,7 +126,7 @@ def matrix(
             f"l{2 * arm:.1f} {2 * arm:.1f}m0 {-2 * arm:.1f}l{-2 * arm:.1f} {2 * arm:.1f}"
             for row, column in marks
         )
-        parts.append(f'<path class="mark" stroke-width="{min(max(0.07 * cell, 1), 3):.1f}" d="{path}"/>')
+        parts.append(f'<path class="mark" stroke-width="{min(max(0.07 * cell, 0.6), 3):.1f}" d="{path}"/>')
     return _svg(left + side + 2, top + side + 2, label, parts)
 
 

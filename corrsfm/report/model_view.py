@@ -233,13 +233,14 @@ def _first_look(view: ModelView) -> dict[str, object]:
     Ranges that end at the frame would cut off what lies outside; so the axes reach to the last point, at the
     same scale, and the camera is near the frame.
     """
-    everything = np.vstack([view.points, view.centres, view.frusta.reshape(-1, 3), [view.low, view.high]])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    everything = np.vstack([view.points, view.centres, view.frusta.reshape(-1, 3)])
+    framed = everything[np.all((everything >= view.low) & (everything <= view.high), axis=1)]
+    corners = np.vstack([everything, [view.low, view.high]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
     # In plotly's camera the whole box has its middle at 0 and the size of the aspect ratio.
     unit = float(np.linalg.norm(view.high - view.low))
     centre = ((view.low + view.high) / 2 - (low + high) / 2) / unit
-    framed = np.all((everything >= view.low) & (everything <= view.high), axis=1)
-    look_at, distance = _fit((everything[framed] - (view.low + view.high) / 2) / unit)
+    look_at, distance = _fit((framed - (view.low + view.high) / 2) / unit)
     centre = centre + look_at
     eye = centre + distance * _TOWARDS_EYE / np.linalg.norm(_TOWARDS_EYE)
     axes = {
@@ -267,6 +268,8 @@ def _fit(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     axes = np.array([right, np.cross(towards, right)])
     half = np.array([[_NARROWEST], [1.0]]) * _HALF_VIEW
     look_at, distance = np.zeros(3), 1.0
+    if not len(points):
+        return look_at, distance
     # Near points are larger, so the middle of the picture depends on the distance and the other way round.
     for _ in range(_ROUNDS):
         across, depth = axes @ (points - look_at).T, (points - look_at) @ towards
