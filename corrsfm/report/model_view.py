@@ -26,11 +26,11 @@ _FARTHEST = 30.0
 _COMMON_DIRECTION = 0.3
 # From behind the cameras, a little to the right, and above them.
 _TOWARDS_EYE = np.array([0.15, -0.89, 0.43])
-# Half the vertical field of view of plotly's camera, and the narrowest picture that shows the whole frame.
+# Half the vertical field of view of plotly's camera, as a tangent; the narrowest picture, width over height,
+# that shows the whole frame; and the room around it.
 _HALF_VIEW = np.tan(np.radians(22.5))
 _NARROWEST = 1.2
 _AROUND = 1.08
-_ROUNDS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -271,7 +271,7 @@ def _fit(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
     if not len(points):
         return look_at, distance
     # Near points are larger, so the middle of the picture depends on the distance and the other way round.
-    for _ in range(_ROUNDS):
+    for _ in range(4):
         across, depth = axes @ (points - look_at).T, (points - look_at) @ towards
         distance = float(np.max(np.abs(across) / half + depth))
         seen = across / np.maximum(distance - depth, 1e-9)

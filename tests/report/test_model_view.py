@@ -95,9 +95,8 @@ def test_photos_that_look_down_are_seen_from_above(model) -> None:
     for number, image in enumerate(sorted(down.images.values(), key=lambda image: image.name)):
         # Each turned by another quarter about the axis that it looks along, which is -z of the world.
         quarter = np.pi / 2 * number
-        rotation = np.array([
-            [np.cos(quarter), np.sin(quarter), 0.0], [np.sin(quarter), -np.cos(quarter), 0.0], [0.0, 0.0, -1.0]
-        ])  # fmt: skip
+        cos, sin = np.cos(quarter), np.sin(quarter)
+        rotation = np.array([[cos, sin, 0.0], [sin, -cos, 0.0], [0.0, 0.0, -1.0]])
         centre = np.array([float(number), float(number**2 % 3), 10.0])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre)
         image.frame.set_cam_from_world(image.camera_id, pose)

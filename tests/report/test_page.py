@@ -226,7 +226,8 @@ def test_the_verdict_stands_above_the_numbers_with_what_was_tried(tmp_path: Path
     write_html(made, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
     verdict = (
-        '<div class="verdict doubtful"><h2>The model is doubtful</h2><ul><li>9 of 10 &lt;b&gt;photos</li></ul>'
+        '<div class="verdict doubtful"><h2>The model is doubtful</h2>'
+        "<ul><li>9 of 10 &lt;b&gt;photos</li></ul>"
         "<h3>What to try next</h3><ul><li>more photos</li></ul>"
     )
     assert text.index(verdict) < text.index('<div class="tiles">')
