@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +73,14 @@ def names_of_verified_pairs(path: Path) -> list[Pair]:
     return sorted((min(names[a], names[b]), max(names[a], names[b])) for a, b in pairs)
 
 
-def read_verified_matches(path: Path) -> dict[Pair, NDArray[np.int32]]:
+def read_verified_matches(path: Path, pairs: Iterable[Pair] | None = None) -> dict[Pair, NDArray[np.int32]]:
     """The matches of every pair with a two-view geometry that agree with it.
+
+    Parameters
+    ----------
+    path : Path
+    pairs : iterable of Pair, optional
+        Read only those of these that have a geometry.
 
     Returns
     -------
@@ -91,7 +97,7 @@ def read_verified_matches(path: Path) -> dict[Pair, NDArray[np.int32]]:
     found: dict[Pair, NDArray[np.int32]] = {}
     with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
-        for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
+        for pair_id, geometry in _geometries(database, names, pairs):
             if not len(geometry.inlier_matches):
                 continue
             id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
@@ -100,3 +106,18 @@ def read_verified_matches(path: Path) -> dict[Pair, NDArray[np.int32]]:
                 id0, id1, matches = id1, id0, matches[:, ::-1]
             found[names[id0], names[id1]] = np.ascontiguousarray(matches)
     return dict(sorted(found.items()))
+
+
+def _geometries(
+    database: pycolmap.Database, names: dict[int, str], pairs: Iterable[Pair] | None
+) -> Iterator[tuple[int, pycolmap.TwoViewGeometry]]:
+    """The geometries of all pairs, or of some, by COLMAP's id of the pair; its smaller image id is first."""
+    if pairs is None:
+        yield from zip(*database.read_two_view_geometries(), strict=True)
+        return
+    ids = {name: image_id for image_id, name in names.items()}
+    for name0, name1 in pairs:
+        if name0 in ids and name1 in ids:
+            id0, id1 = sorted((ids[name0], ids[name1]))
+            if database.exists_two_view_geometry(id0, id1):
+                yield pycolmap.image_pair_to_pair_id(id0, id1), database.read_two_view_geometry(id0, id1)

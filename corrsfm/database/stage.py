@@ -27,6 +27,7 @@ from corrsfm.workspace.hloc import FEATURES, PRUNED, PrunedMatches
 from corrsfm.workspace.lists import Index, read_index, read_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["verify_matches"]
 
@@ -37,6 +38,7 @@ VOTES_VERSION = "votes-1"
 MAX_PAIRS_ASKED = 400
 
 
+@keeps_warnings("verified matches")
 def verify_matches(
     workspace: Workspace, config: cfg.DatabaseConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:

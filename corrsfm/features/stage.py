@@ -22,12 +22,14 @@ from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["extract_features"]
 
 logger = logging.getLogger("corrsfm")
 
 
+@keeps_warnings("features")
 def extract_features(
     workspace: Workspace, config: cfg.FeaturesConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:

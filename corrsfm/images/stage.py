@@ -18,12 +18,14 @@ from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import check_hloc_keys
 from corrsfm.workspace.lists import Index, read_index, write_index
 from corrsfm.workspace.resume import StageOutcome, finish
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["index_photos"]
 
 logger = logging.getLogger("corrsfm")
 
 
+@keeps_warnings("images")
 def index_photos(
     workspace: Workspace,
     images_dir: Path,

@@ -12,10 +12,12 @@ from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["match_pairs"]
 
 
+@keeps_warnings("matches")
 def match_pairs(
     workspace: Workspace, config: cfg.MatchesConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:

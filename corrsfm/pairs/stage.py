@@ -18,12 +18,14 @@ from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["make_pairs"]
 
 logger = logging.getLogger("corrsfm")
 
 
+@keeps_warnings("pairs")
 def make_pairs(
     workspace: Workspace, config: cfg.PairsConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:

@@ -17,6 +17,7 @@ from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["prune_matches"]
 
@@ -29,6 +30,7 @@ PAIRS_PRUNED_TOGETHER = 128
 PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD = 2
 
 
+@keeps_warnings("pruned matches")
 def prune_matches(
     workspace: Workspace, config: cfg.PruneConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:

@@ -24,7 +24,8 @@ from corrsfm.reconstruction.candidates import (
     map_candidate,
 )
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
-from corrsfm.reconstruction.explained import Explained, explain
+from corrsfm.reconstruction.epipolar import TwoViews
+from corrsfm.reconstruction.explained import Explained, explain, is_explained
 from corrsfm.reconstruction.focal_slack import FocalSlack, measure_focal_slack
 from corrsfm.reconstruction.folds.evidence import FoldEvidence
 from corrsfm.reconstruction.folds.unfold import (
@@ -38,7 +39,7 @@ from corrsfm.reconstruction.pool import CandidatePool
 from corrsfm.reconstruction.predicted import NeighbourTables, predict, sample_pairs
 from corrsfm.reconstruction.registration import register_again
 from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
-from corrsfm.reconstruction.views import Views, views_of
+from corrsfm.reconstruction.views import Views, rays_of, views_of
 from corrsfm.types import Features, Pair
 
 __all__ = ["SceneEvidence", "Selection", "policy_for", "select_model"]
@@ -91,6 +92,13 @@ class SceneEvidence:
     def explain(self, views: Views) -> Explained:
         """What a model explains of the verified matches."""
         return explain(views, self.keypoints, self.verified)
+
+    def explained_matches(self, views: Views, pair: Pair) -> NDArray[np.bool_]:
+        """Which verified matches of a pair of registered photos a model explains; (K,) bool."""
+        name0, name1 = pair
+        rays = rays_of({name: views[name] for name in pair}, self.keypoints)
+        two = TwoViews(views[name0], views[name1], rays[name0], rays[name1])
+        return is_explained(two, self.verified[pair])
 
     def count_predicted(self, views: Views) -> int:
         """Matches that a model predicts; the neighbours of features are computed when first needed."""

@@ -19,7 +19,7 @@ from corrsfm.reconstruction.epipolar import TwoViews
 from corrsfm.reconstruction.views import Views, rays_of
 from corrsfm.types import Pair
 
-__all__ = ["Explained", "ExplainedPair", "explain"]
+__all__ = ["Explained", "ExplainedPair", "explain", "is_explained"]
 
 MAX_DISTANCE_PX = 4.0
 CONTRADICTED_BELOW = 0.5
@@ -185,11 +185,10 @@ def explain(
         num_explained, angle_deg = 0, 0.0
         if is_registered and len(matches):
             two = TwoViews(views[name0], views[name1], rays[name0], rays[name1])
-            is_explained = two.sampson_distance_px(matches) < max_distance_px
-            is_explained &= two.in_front(matches)
-            num_explained = int(is_explained.sum())
+            explained = is_explained(two, matches, max_distance_px=max_distance_px)
+            num_explained = int(explained.sum())
             if num_explained:
-                angle_deg = float(np.median(two.ray_angles_deg(matches[is_explained])))
+                angle_deg = float(np.median(two.ray_angles_deg(matches[explained])))
         pairs.append(
             ExplainedPair(
                 name0=name0,
@@ -201,3 +200,23 @@ def explain(
             )
         )
     return Explained(pairs=tuple(pairs), registered=tuple(sorted(views)))
+
+
+def is_explained(
+    two: TwoViews, matches: NDArray[np.integer], *, max_distance_px: float = MAX_DISTANCE_PX
+) -> NDArray[np.bool_]:
+    """Which matches of two registered photos a model explains.
+
+    Parameters
+    ----------
+    two : TwoViews
+    matches : (K, 2) int
+        Keypoint indices.
+    max_distance_px : float
+        Largest Sampson distance of an explained match.
+
+    Returns
+    -------
+    (K,) bool
+    """
+    return (two.sampson_distance_px(matches) < max_distance_px) & two.in_front(matches)

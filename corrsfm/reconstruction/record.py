@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from corrsfm.reconstruction.best_model import Selection
+from corrsfm.reconstruction.best_model import SceneEvidence, Selection
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.explained import ExplainedPair
 
@@ -12,14 +12,18 @@ __all__ = ["FORMAT_VERSION", "record_of"]
 
 FORMAT_VERSION = 1
 _NUM_WORST = 5
+# Pairs of which every match is recorded, for pictures; all of them would make the record long.
+_NUM_IN_FULL = 12
 
 
-def record_of(selection: Selection) -> dict[str, Any]:
+def record_of(selection: Selection, evidence: SceneEvidence) -> dict[str, Any]:
     """The verdict on a model and what it rests on.
 
     Parameters
     ----------
     selection : Selection
+    evidence : SceneEvidence
+        That the selection was made by.
 
     Returns
     -------
@@ -27,7 +31,9 @@ def record_of(selection: Selection) -> dict[str, Any]:
         ``verdict`` (grade, reasons, next steps), ``explained_share``, ``num_predicted_matches`` (null if no
         choice had to be made), ``support``, ``contradicted_pairs``, ``misplaced_photos``, ``loose_ends``,
         ``pairs`` (verified and explained matches of every verified pair), ``models_tried``,
-        ``stopped_because`` and ``folds`` (null where too few pairs tell).
+        ``stopped_because`` and ``folds`` (null where too few pairs tell). The twelve least explained of
+        ``contradicted_pairs`` have ``explained_matches``: a digit for each verified match in the order of the
+        database, 1 if the model explains it, else 0.
     """
     choice, explained = selection.choice, selection.choice.chosen.explained
     return {
@@ -40,7 +46,10 @@ def record_of(selection: Selection) -> dict[str, Any]:
         "explained_share": explained.share,
         "num_predicted_matches": choice.chosen.num_predicted,
         "support": choice.support,
-        "contradicted_pairs": [_pair(pair) for pair in explained.contradicted],
+        "contradicted_pairs": [
+            _pair(pair) | (_matches(pair, choice.chosen, evidence) if rank < _NUM_IN_FULL else {})
+            for rank, pair in enumerate(explained.contradicted)
+        ],
         "misplaced_photos": list(explained.misplaced),
         "loose_ends": list(explained.loose_ends),
         "pairs": [_pair(pair) for pair in explained.pairs],
@@ -73,6 +82,11 @@ def _pair(pair: ExplainedPair) -> dict[str, Any]:
         "num_explained": pair.num_explained,
         "registered": pair.is_registered,
     }
+
+
+def _matches(pair: ExplainedPair, model: Tried, evidence: SceneEvidence) -> dict[str, str]:
+    explained = evidence.explained_matches(model.views, (pair.name0, pair.name1))
+    return {"explained_matches": "".join("01"[int(match)] for match in explained)}
 
 
 def _tried(model: Tried, *, chosen: bool) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import logging
 import shutil
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -19,7 +19,7 @@ from corrsfm.errors import ReconstructionError, first_few
 from corrsfm.files import atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
-from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
+from corrsfm.reconstruction.best_model import SceneEvidence, policy_for, select_model
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.record import record_of
@@ -28,6 +28,7 @@ from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.warned import keeps_warnings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -37,6 +38,7 @@ __all__ = ["reconstruct"]
 logger = logging.getLogger("corrsfm")
 
 
+@keeps_warnings("models")
 def reconstruct(
     workspace: Workspace, config: cfg.ReconstructionConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
@@ -87,15 +89,15 @@ def reconstruct(
         except ReconstructionError:
             workspace.put_models_aside()
             raise
-    if choice.selection is not None:
-        atomic_write_json(workspace.evidence, record_of(choice.selection))
+    if choice.record is not None:
+        atomic_write_json(workspace.evidence, choice.record)
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
 
 
 class _Choice:
-    """Chooses the first model with what the workspace knows; keeps the selection for the record."""
+    """Chooses the first model with what the workspace knows; keeps the record of it."""
 
     def __init__(
         self,
@@ -110,7 +112,7 @@ class _Choice:
         self._config = config
         self._run = run
         self._workdir = workdir
-        self.selection: Selection | None = None
+        self.record: dict[str, Any] | None = None
 
     def __call__(
         self, first: pycolmap.Reconstruction | None, seconds: float
@@ -121,9 +123,12 @@ class _Choice:
             if folder != self._workdir:
                 shutil.rmtree(folder)
         with ItemStore(workspace.features, FEATURES).reader() as load:
-            self.selection = select_model(
+            evidence = SceneEvidence(
+                self._names, read_verified_matches(workspace.database), load, seed=run.seed
+            )
+            selection = select_model(
                 first,
-                SceneEvidence(self._names, read_verified_matches(workspace.database), load, seed=run.seed),
+                evidence,
                 workspace.database,
                 self._workdir,
                 policy=policy_for(self._config.max_models_tried, seconds),
@@ -134,19 +139,20 @@ class _Choice:
                 num_processes=count_threads(run.threads),
                 unfold=self._config.unfold,
             )
+            self.record = None if selection is None else record_of(selection, evidence)
         if workspace.candidates.is_dir():
             shutil.rmtree(workspace.candidates)
-        if self.selection is None:
+        if selection is None:
             return None
-        choice = self.selection.choice
-        if self.selection.left_out:
-            logger.info("unfolded: %d pairs of look-alike places were left out", len(self.selection.left_out))
+        choice = selection.choice
+        if selection.left_out:
+            logger.info("unfolded: %d pairs of look-alike places were left out", len(selection.left_out))
         if len(choice.tried) > 1:
             logger.info(
                 "models tried: %d (%s); chosen: %s", len(choice.tried), choice.reason, choice.chosen.name
             )
-        logger.info("verdict: %s", self.selection.verdict)
-        return self.selection.model
+        logger.info("verdict: %s", selection.verdict)
+        return selection.model
 
     def _cameras_on_trial(self) -> StartingCameras | None:
         """Other cameras to try; none where the user said which photos share one."""

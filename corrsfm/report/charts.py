@@ -9,10 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["bars", "histogram", "matrix"]
+__all__ = ["MOST_NAMES", "bars", "histogram", "matrix"]
 
 _WIDTH, _HEIGHT = 340, 210
 _BARS_WIDTH = 460
+# Of a matrix: names beside the rows, and their characters.
+MOST_NAMES, _LONGEST_NAME = 40, 18
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 10, 12, 40
 
 
@@ -78,21 +80,59 @@ def bars(rows: Sequence[tuple[str, float]], unit: str) -> str:
     return _svg(_BARS_WIDTH, height, f"{unit} for each of {', '.join(label for label, _ in rows)}", parts)
 
 
-def matrix(picture_uri: str, names: Sequence[str]) -> str:
-    """A square picture of photos by photos, with their numbers along two sides."""
-    side, margin = 500, 34
+def matrix(
+    picture_uri: str,
+    names: Sequence[str],
+    label: str,
+    *,
+    numbers: Sequence[int] | None = None,
+    marks: Sequence[tuple[int, int]] = (),
+) -> str:
+    """A square picture of photos by photos, with their numbers along two sides, and names if they fit.
+
+    Parameters
+    ----------
+    picture_uri : str
+        One row and one column a photo, or fewer.
+    names : sequence of str
+    label : str
+        What it shows, for those who do not see it.
+    numbers : sequence of int, optional
+        Of the photos; 1, 2, … by default.
+    marks : sequence of (row, column)
+        Cells to cross out.
+    """
+    numbers = numbers or range(1, len(names) + 1)
+    side, top = 500, 34
+    shown = [_short(name) for name in names] if len(names) <= MOST_NAMES else []
+    left = 34 + (12 + 6 * max(map(len, shown)) if shown else 0)
+    cell = side / max(len(names), 1)
     parts = [
-        f'<image href="{picture_uri}" x="{margin}" y="{margin}" width="{side}" height="{side}" '
+        f'<image href="{picture_uri}" x="{left}" y="{top}" width="{side}" height="{side}" '
         'preserveAspectRatio="none" style="image-rendering:pixelated"/>',
-        f'<rect class="frame" x="{margin}" y="{margin}" width="{side}" height="{side}"/>',
+        f'<rect class="frame" x="{left}" y="{top}" width="{side}" height="{side}"/>',
     ]
     step = _nice(math.ceil(len(names) / 15))
     for index in range(0, len(names), step):
-        centre = margin + side * (index + 0.5) / len(names)
-        parts.append(_text(centre, margin - 8, str(index + 1), "middle"))
-        parts.append(_text(margin - 6, centre + 4, str(index + 1), "end"))
-    total = side + margin + 2
-    return _svg(total, total, f"verified matches of all pairs of {len(names)} photos", parts)
+        parts.append(_text(left + cell * (index + 0.5), top - 8, str(numbers[index]), "middle"))
+    for index in range(0, len(names), 1 if shown else step):
+        row = f"{shown[index]}  {numbers[index]}" if shown else str(numbers[index])
+        parts.append(_text(left - 6, top + cell * (index + 0.5) + 4, row, "end"))
+    if marks:
+        # In a large matrix the cross is larger than its cell, so that it is seen.
+        arm = max(0.22 * cell, 1.8)
+        path = "".join(
+            f"M{left + cell * (column + 0.5) - arm:.1f} {top + cell * (row + 0.5) - arm:.1f}"
+            f"l{2 * arm:.1f} {2 * arm:.1f}m0 {-2 * arm:.1f}l{-2 * arm:.1f} {2 * arm:.1f}"
+            for row, column in marks
+        )
+        parts.append(f'<path class="mark" stroke-width="{min(max(0.07 * cell, 0.6), 3):.1f}" d="{path}"/>')
+    return _svg(left + side + 2, top + side + 2, label, parts)
+
+
+def _short(name: str) -> str:
+    """The end of a long name: there names of one folder differ."""
+    return name if len(name) <= _LONGEST_NAME else f"…{name[1 - _LONGEST_NAME :]}"
 
 
 def _text(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> str:

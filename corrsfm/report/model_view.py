@@ -14,11 +14,23 @@ from corrsfm.report.pictures import DROPPED_COLOUR
 __all__ = ["ModelView", "make_view", "plotly_view"]
 
 _MAX_POINTS = 20_000
-# Points farther from the middle than this times the 75th percentile of all distances are not shown: a few of
-# them, far behind the scene, would shrink the rest to a dot.
-_REACH = 2.5
-# Above this length of the mean viewing direction, photos count as looking one way.
+# The frame reaches to the cameras within this times the 90th percentile of their distances from their middle,
+# and to the bulk of the points within this times the median of theirs from the same place.
+_REACH = 3.0
+_BULK = (0.05, 0.95)
+_MARGIN = 0.04
+# Points farther from the middle of the frame than this times its diagonal are left out: at some distance,
+# single precision no longer holds the rest apart.
+_FARTHEST = 30.0
+# Above this length of a mean direction, photos count as having it in common.
 _COMMON_DIRECTION = 0.3
+# From behind the cameras, a little to the right, and above them.
+_TOWARDS_EYE = np.array([0.15, -0.89, 0.43])
+# Half the vertical field of view of plotly's camera, as a tangent; the narrowest picture, width over height,
+# that shows the whole frame; and the room around it.
+_HALF_VIEW = np.tan(np.radians(22.5))
+_NARROWEST = 1.2
+_AROUND = 1.08
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,6 +48,9 @@ class ModelView:
         Each camera's centre and the four corners of its picture.
     names : tuple of str
         Of the cameras' photos.
+    low, high : (3,) float64
+        Corners of the frame: the box of the cameras and of the bulk of the points, which the first look
+        shows. Single points and cameras may lie outside.
     """
 
     points: NDArray[np.float64]
@@ -43,10 +58,12 @@ class ModelView:
     centres: NDArray[np.float64]
     frusta: NDArray[np.float64]
     names: tuple[str, ...]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
 
 
 def make_view(model: pycolmap.Reconstruction) -> ModelView:
-    """Choose at most 20 000 points, leave out the farthest ones, and turn everything upright."""
+    """Choose at most 20 000 points, turn everything upright, and find the frame of the first look."""
     images = sorted(
         (image for image in model.images.values() if image.has_pose), key=lambda image: image.name
     )
@@ -55,7 +72,11 @@ def make_view(model: pycolmap.Reconstruction) -> ModelView:
     centres = np.array([image.projection_center() for image in images]).reshape(-1, 3)
     upright = _upright(rotations, centres)
     points, colours = _points(model)
-    size = _frustum_size(points, centres)
+    points, centres, rotations = points @ upright.T, centres @ upright.T, rotations @ upright.T
+    low, high = _frame(points, centres)
+    diagonal = float(np.linalg.norm(high - low))
+    near = np.linalg.norm(points - (low + high) / 2, axis=1) <= _FARTHEST * diagonal
+    size = _frustum_size(diagonal, centres)
     frusta = np.array(
         [
             _frustum(image.camera, rotation, centre, size)
@@ -63,23 +84,30 @@ def make_view(model: pycolmap.Reconstruction) -> ModelView:
         ]
     ).reshape(-1, 5, 3)
     return ModelView(
-        points=points @ upright.T,
-        colours=colours,
-        centres=centres @ upright.T,
-        frusta=frusta @ upright.T,
+        points=points[near],
+        colours=colours[near],
+        centres=centres,
+        frusta=frusta,
         names=tuple(image.name for image in images),
+        low=low,
+        high=high,
     )
 
 
 def _upright(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation that takes the photos' average up to z, and their common viewing direction to y."""
+    if not len(rotations):
+        return np.eye(3)
     # Cameras look along z with y down, and the rows of a rotation are the camera's axes in the world.
-    up = -rotations[:, 1].sum(axis=0)
+    up, forward = -rotations[:, 1].mean(axis=0), rotations[:, 2].mean(axis=0)
+    if np.linalg.norm(up) < _COMMON_DIRECTION < np.linalg.norm(forward):
+        # Photos that look down, turned any way about that.
+        up = -forward
     if np.linalg.norm(up) < 1e-6:
         return np.eye(3)
     up /= np.linalg.norm(up)
     level = np.eye(3) - np.outer(up, up)
-    forward = level @ rotations[:, 2].mean(axis=0)
+    forward = level @ forward
     if np.linalg.norm(forward) < _COMMON_DIRECTION:
         # The photos look all ways, around an object or a room: their widest spread goes from left to right.
         widest = np.linalg.svd((centres - centres.mean(axis=0)) @ level)[2][0]
@@ -92,29 +120,45 @@ def _upright(rotations: NDArray[np.float64], centres: NDArray[np.float64]) -> ND
 
 def _points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     ids = np.array(sorted(model.points3D), np.int64)
-    if not len(ids):
-        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     if len(ids) > _MAX_POINTS:
         ids = np.sort(np.random.default_rng(0).choice(ids, _MAX_POINTS, replace=False))
-    points = np.array([model.points3D[int(number)].xyz for number in ids])
-    colours = np.array([model.points3D[int(number)].color for number in ids], np.uint8)
-    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    reach = _REACH * np.percentile(distances, 75)
-    near = distances <= max(reach, 1e-9)
-    return points[near], colours[near]
+    points = [model.points3D[int(number)] for number in ids]
+    return (
+        np.array([point.xyz for point in points]).reshape(-1, 3),
+        np.array([point.color for point in points], np.uint8).reshape(-1, 3),
+    )
 
 
-def _frustum_size(points: NDArray[np.float64], centres: NDArray[np.float64]) -> float:
-    """Length of a drawn camera: a fraction of the scene, less where cameras stand close together."""
-    everything = np.vstack([points, centres])
-    extent = float(np.linalg.norm(np.ptp(everything, axis=0))) if len(everything) else 1.0
-    size = 0.04 * extent
+def _frame(
+    points: NDArray[np.float64], centres: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners of the box of the cameras and of most points near them; outliers have no say."""
+    if not len(centres) + len(points):
+        return -np.ones(3), np.ones(3)
+    middle = np.median(centres if len(centres) else points, axis=0)
+    corners = []
+    if len(centres):
+        distances = np.linalg.norm(centres - middle, axis=1)
+        together = centres[distances <= _REACH * np.percentile(distances, 90)]
+        corners += [together.min(axis=0), together.max(axis=0)]
+    if len(points):
+        distances = np.linalg.norm(points - middle, axis=1)
+        near = points[distances <= _REACH * np.median(distances)]
+        corners += list(np.quantile(near, _BULK, axis=0))
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    margin = max(_MARGIN * float(np.linalg.norm(high - low)), 1e-9)
+    return low - margin, high + margin
+
+
+def _frustum_size(diagonal: float, centres: NDArray[np.float64]) -> float:
+    """Length of a drawn camera: a fraction of the frame, less where cameras stand close together."""
+    size = 0.04 * diagonal
     if 1 < len(centres) <= 2000:
         squares = np.sum(centres**2, axis=1)
         distances = squares[:, None] + squares[None] - 2 * centres @ centres.T
         np.fill_diagonal(distances, np.inf)
         nearest = float(np.sqrt(np.median(np.maximum(distances.min(axis=1), 0))))
-        size = min(size, max(0.7 * nearest, 0.01 * extent))
+        size = min(size, max(0.7 * nearest, 0.01 * diagonal))
     return size
 
 
@@ -158,18 +202,10 @@ def plotly_view(view: ModelView) -> str:
         text=list(view.names), hovertemplate="%{text}<extra></extra>",
         marker={"size": 3, "color": DROPPED_COLOUR},
     )  # fmt: skip
-    hidden = {"visible": False, "showspikes": False}
     figure = graph_objects.Figure(
         [cloud, frusta, photos],
         layout={
-            "scene": {
-                "aspectmode": "data",
-                "xaxis": hidden,
-                "yaxis": hidden,
-                "zaxis": hidden,
-                "camera": {"eye": {"x": 0.25, "y": -1.55, "z": 0.75}},
-                "dragmode": "orbit",
-            },
+            "scene": _first_look(view),
             "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
             "showlegend": False,
             "paper_bgcolor": "rgba(0,0,0,0)",
@@ -189,6 +225,59 @@ def plotly_view(view: ModelView) -> str:
             "plotlyServerURL": "",
         },
     )
+
+
+def _first_look(view: ModelView) -> dict[str, object]:
+    """Plotly's scene with everything in it, and its camera so that the frame fills the picture.
+
+    Ranges that end at the frame would cut off what lies outside; so the axes reach to the last point, at the
+    same scale, and the camera is near the frame.
+    """
+    everything = np.vstack([view.points, view.centres, view.frusta.reshape(-1, 3)])
+    framed = everything[np.all((everything >= view.low) & (everything <= view.high), axis=1)]
+    corners = np.vstack([everything, [view.low, view.high]])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    # In plotly's camera the whole box has its middle at 0 and the size of the aspect ratio.
+    unit = float(np.linalg.norm(view.high - view.low))
+    centre = ((view.low + view.high) / 2 - (low + high) / 2) / unit
+    look_at, distance = _fit((framed - (view.low + view.high) / 2) / unit)
+    centre = centre + look_at
+    eye = centre + distance * _TOWARDS_EYE / np.linalg.norm(_TOWARDS_EYE)
+    axes = {
+        f"{axis}axis": {"visible": False, "showspikes": False, "range": [float(low[i]), float(high[i])]}
+        for i, axis in enumerate("xyz")
+    }
+
+    def named(values: NDArray[np.float64]) -> dict[str, float]:
+        return dict(zip("xyz", values.round(4).tolist(), strict=True))
+
+    return {
+        **axes,
+        "aspectmode": "manual",
+        "aspectratio": named((high - low) / unit),
+        "camera": {"eye": named(eye), "center": named(centre)},
+        "dragmode": "orbit",
+    }
+
+
+def _fit(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Where to look, and from how far in the direction of the eye, so that (N, 3) points fill the picture."""
+    towards = _TOWARDS_EYE / np.linalg.norm(_TOWARDS_EYE)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    axes = np.array([right, np.cross(towards, right)])
+    half = np.array([[_NARROWEST], [1.0]]) * _HALF_VIEW
+    look_at, distance = np.zeros(3), 1.0
+    if not len(points):
+        return look_at, distance
+    # Near points are larger, so the middle of the picture depends on the distance and the other way round.
+    for _ in range(4):
+        across, depth = axes @ (points - look_at).T, (points - look_at) @ towards
+        distance = float(np.max(np.abs(across) / half + depth))
+        seen = across / np.maximum(distance - depth, 1e-9)
+        look_at = look_at + distance * (seen.min(axis=1) + seen.max(axis=1)) / 2 @ axes
+    across, depth = axes @ (points - look_at).T, (points - look_at) @ towards
+    return look_at, _AROUND * float(np.max(np.abs(across) / half + depth))
 
 
 def _frustum_lines(frusta: NDArray[np.float64]) -> NDArray[np.float64]:

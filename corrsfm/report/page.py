@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from corrsfm.colmap.models import observation_errors
 from corrsfm.errors import DependencyError
 from corrsfm.files import atomic_write_text
 from corrsfm.report import charts, pictures
+from corrsfm.report.explained import LoadVerified, explained_pairs
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.model_view import ModelView, make_view, plotly_view
 from corrsfm.report.statistics import SceneReport
@@ -29,7 +30,7 @@ LoadMatches = Callable[[str, str], tuple[NDArray[np.float32], NDArray[np.float32
 convention, and (M,) bool, the matches that pruning kept."""
 
 _DRAWN_PAIRS = 3
-_DRAWN_SIZE = 560
+_MOST_LINES = (150, 60)
 _THUMBNAILS = 24
 _THUMBNAIL_SIZE = 120
 _LISTED_PAIRS = 300
@@ -42,6 +43,7 @@ def write_html(
     model: pycolmap.Reconstruction | None = None,
     images_dir: Path | None = None,
     load_matches: LoadMatches | None = None,
+    load_verified: LoadVerified | None = None,
 ) -> None:
     """Write the page; it appears at ``path`` whole or not at all.
 
@@ -56,6 +58,8 @@ def write_html(
         Folder of the photos, for drawn matches and thumbnails; missing photos are left out.
     load_matches : callable, optional
         Gives the matches to draw.
+    load_verified : callable, optional
+        Gives the verified matches of contradicted pairs.
 
     Raises
     ------
@@ -66,7 +70,9 @@ def write_html(
         _verdict(report),
         _tiles(report),
         _missing(report, images_dir),
+        section("What the run warned of", _warnings(report)),
         section("Model", _model_view(make_view(model))) if model is not None else "",
+        section("What the model explains", explained_pairs(report, images_dir, load_verified)),
         section("Statistics", _statistics(report)),
         section("Distributions", _histograms(report, model)),
         section("View graph", _view_graph(report)),
@@ -84,10 +90,10 @@ def _subtitle(report: SceneReport) -> str:
 
 
 def _verdict(report: SceneReport) -> str:
-    """The verdict on the first model and what it rests on, above everything else."""
+    """The verdict on the first model, what to do about it and what it rests on, above everything else."""
     if not report.verdict:
         return ""
-    grade = report.evidence["verdict"]["grade"]
+    verdict = report.evidence["verdict"]
     facts = []
     if (predicted := report.evidence.get("num_predicted_matches")) is not None:
         num = len(report.evidence["models_tried"])
@@ -95,8 +101,18 @@ def _verdict(report: SceneReport) -> str:
     if left_out := report.evidence.get("folds", {}).get("left_out"):
         pairs = "1 pair" if len(left_out) == 1 else f"{len(left_out)} pairs"
         facts.append(f"{pairs} of look-alike places left out to unfold it")
-    note = f"<br>{html.escape('; '.join(facts))}" if facts else ""
-    return f'<p class="verdict {grade}"><b>{html.escape(report.verdict)}</b>{note}</p>'
+    steps = _items(verdict["next_steps"])
+    return (
+        f'<div class="verdict {verdict["grade"]}"><h2>The model is {verdict["grade"]}</h2>'
+        f"<ul>{_items(verdict['reasons'])}</ul>"
+        + (f"<h3>What to try next</h3><ul>{steps}</ul>" if steps else "")
+        + (f'<p class="note">{html.escape("; ".join(facts))}</p>' if facts else "")
+        + "</div>"
+    )
+
+
+def _items(texts: Sequence[str]) -> str:
+    return "".join(f"<li>{html.escape(text)}</li>" for text in texts)
 
 
 def _tiles(report: SceneReport) -> str:
@@ -161,13 +177,23 @@ def _missing_row(image: MissingPhoto, images_dir: Path | None) -> str:
     )
 
 
+def _warnings(report: SceneReport) -> str:
+    if not report.warnings:
+        return ""
+    rows = "".join(
+        f'<tr><th>{html.escape(warning.stage)}</th><td class="lines">{html.escape(warning.message)}</td></tr>'
+        for warning in report.warnings
+    )
+    return f'<div class="scroll tall"><table class="facts">{rows}</table></div>'
+
+
 def _model_view(view: ModelView) -> str:
     shown = f"{len(view.points):,} points and {len(view.names):,} cameras"
     try:
         drawn = f'<div class="model">{plotly_view(view)}</div>'
         note = f"{shown}. Drag to turn, scroll to zoom; point at a camera to read its photo's name."
     except DependencyError:
-        picture = pictures.draw_views(view.points, view.colours, view.centres)
+        picture = pictures.draw_views(view.points, view.colours, view.centres, (view.low, view.high))
         drawn = (
             f'<img class="wide" src="{pictures.png_uri(picture)}" alt="the model from above and the side">'
         )
@@ -190,13 +216,18 @@ def _histograms(report: SceneReport, model: pycolmap.Reconstruction | None) -> s
         step = 0.05 * max(1, np.ceil(np.percentile(errors, 99) / 1.5))
         edges = np.round(step * np.arange(31), 2)
         drawn.append(charts.histogram(errors, edges, "reprojection error, px", "observations"))
-    ratios = [pair.num_verified / pair.num_kept for pair in report.pairs if pair.num_kept]
+    ratios = [pair.num_verified / pair.num_kept for pair in report.pairs if pair.num_verified]
     if ratios:
         edges = np.linspace(0, 1, 21)
-        drawn.append(charts.histogram(ratios, edges, "inlier ratio of kept matches", "pairs"))
+        drawn.append(charts.histogram(ratios, edges, "inlier ratio of verified pairs", "pairs"))
     if not drawn:
         return ""
-    return '<div class="charts">' + "".join(f"<figure>{chart}</figure>" for chart in drawn) + "</div>"
+    charts_of = '<div class="charts">' + "".join(f"<figure>{chart}</figure>" for chart in drawn) + "</div>"
+    num_without = len(report.pairs) - len(ratios)
+    if not num_without:
+        return charts_of
+    count = "1 pair has" if num_without == 1 else f"{num_without:,} pairs have"
+    return f'{charts_of}<p class="note">{count} no verified match and no inlier ratio.</p>'
 
 
 def _view_graph(report: SceneReport) -> str:
@@ -206,8 +237,9 @@ def _view_graph(report: SceneReport) -> str:
     low, high = pictures.view_graph_scale(report.pairs)
     ramp = pictures.png_uri(pictures.shade(np.linspace(0, 1, 128)[None]))
     names = "".join(f"<li>{html.escape(name)}</li>" for name in report.image_names[:1000])
+    label = f"verified matches of all pairs of {len(report.image_names)} photos"
     return (
-        f'<div class="graph"><figure>{charts.matrix(uri, report.image_names)}</figure><div>'
+        f'<div class="graph"><figure>{charts.matrix(uri, report.image_names, label)}</figure><div>'
         "<p>Rows and columns are photos in order of their names; each cell is a pair.</p>"
         f'<p class="legend">verified matches <span>{low:,}</span><img src="{ramp}" alt="pale to dark">'
         f"<span>{high:,}</span></p>"
@@ -227,7 +259,7 @@ def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMat
     legend = (
         f'<p class="legend"><i style="background:{pictures.KEPT_COLOUR}"></i> kept by pruning '
         f'<i style="background:{pictures.DROPPED_COLOUR}"></i> dropped; '
-        "at most 150 and 60 lines are drawn</p>"
+        f"at most {_MOST_LINES[0]} and {_MOST_LINES[1]} lines are drawn</p>"
     )
     listed = sorted(report.pairs, key=lambda pair: -pair.num_verified)[:_LISTED_PAIRS]
     if not listed:
@@ -249,16 +281,9 @@ def _matches(report: SceneReport, images_dir: Path | None, load_matches: LoadMat
 
 
 def _pairs_to_draw(report: SceneReport) -> list[tuple[str, PairStatistics]]:
-    """Three contradicted pairs, and of the other verified ones the three weakest and three strong ones.
-
-    The strong ones are of different photos.
-    """
-    against = {frozenset(pair): rank for rank, pair in enumerate(report.contradicted_pairs[:_DRAWN_PAIRS])}
-    contradicted = [pair for pair in report.pairs if frozenset((pair.name0, pair.name1)) in against]
-    contradicted.sort(key=lambda pair: against[frozenset((pair.name0, pair.name1))])
+    """Three strong pairs of different photos, and the three weakest of the other verified ones."""
     ranked = sorted(
-        (pair for pair in report.pairs if pair.num_verified > 0 and pair not in contradicted),
-        key=lambda pair: -pair.num_verified,
+        (pair for pair in report.pairs if pair.num_verified > 0), key=lambda pair: -pair.num_verified
     )
     strong: list[PairStatistics] = []
     seen: set[str] = set()
@@ -267,23 +292,18 @@ def _pairs_to_draw(report: SceneReport) -> list[tuple[str, PairStatistics]]:
             strong.append(pair)
             seen |= {pair.name0, pair.name1}
     weak = [pair for pair in ranked if pair not in strong][-_DRAWN_PAIRS:]
-    return (
-        [("contradicted by the model", pair) for pair in contradicted]
-        + [("strong", pair) for pair in strong]
-        + [("weak", pair) for pair in weak]
-    )
+    return [("strong", pair) for pair in strong] + [("weak", pair) for pair in weak]
 
 
 def _drawn_pair(kind: str, pair: PairStatistics, images_dir: Path, load_matches: LoadMatches) -> str:
-    photos = [pictures.read_photo(images_dir / name, _DRAWN_SIZE) for name in (pair.name0, pair.name1)]
-    if photos[0] is None or photos[1] is None:
-        return ""
     points0, points1, kept = load_matches(pair.name0, pair.name1)
-    (photo0, scale0), (photo1, scale1) = photos[0], photos[1]
-    drawn = pictures.draw_matches((photo0, photo1), (scale0, scale1), (points0, points1), kept)
+    paths = (images_dir / pair.name0, images_dir / pair.name1)
+    uri = pictures.matches_uri(paths, (points0, points1), kept, most=_MOST_LINES)
+    if uri is None:
+        return ""
     names = html.escape(f"{pair.name0} – {pair.name1}")
     return (
-        f'<figure><img class="wide" src="{pictures.jpeg_uri(drawn)}" alt=""><figcaption>'
+        f'<figure><img class="wide" src="{uri}" alt=""><figcaption>'
         f"<b>{kind}</b> {names}: {pair.num_putative:,} putative, "
         f"{pair.num_kept:,} kept, {pair.num_verified:,} verified</figcaption></figure>"
     )

@@ -21,19 +21,25 @@ __all__ = [
     "DROPPED_COLOUR",
     "KEPT_COLOUR",
     "draw_matches",
+    "draw_shares",
     "draw_view_graph",
     "draw_views",
     "jpeg_uri",
+    "matches_uri",
     "png_uri",
     "read_photo",
+    "share_colours",
     "view_graph_scale",
 ]
 
 # Told apart by everyone, and bright enough to stand on a dark photo (Okabe and Ito's palette).
 KEPT_COLOUR = "#56B4E9"
 DROPPED_COLOUR = "#D55E00"
+# Red and green differ in lightness as well, for readers who cannot tell the hues apart.
+_SHARE_COLOURS = ("#B23A0E", "#F6EBCF", "#43B48A")
 _MATCHED_GREY = 222
 _MAX_MATRIX_SIDE = 500
+_DRAWN_SIZE = 560
 
 
 def _bgr(colour: str) -> tuple[int, int, int]:
@@ -105,6 +111,35 @@ def draw_matches(
     return canvas
 
 
+def matches_uri(
+    paths: tuple[Path, Path],
+    points: tuple[NDArray[np.float32], NDArray[np.float32]],
+    kept: NDArray[np.bool_],
+    *,
+    most: tuple[int, int],
+) -> str | None:
+    """The matches of two photos drawn on them, as the text of a link; None if a photo cannot be read.
+
+    Parameters
+    ----------
+    paths : pair of Path
+        The photos.
+    points : pair of (M, 2) float32
+        Matched keypoints in pixels of the files, COLMAP convention.
+    kept : (M,) bool
+        Matches in `KEPT_COLOUR`; the others are in `DROPPED_COLOUR`, below them.
+    most : pair of int
+        Lines drawn at most of both kinds.
+    """
+    photo0, photo1 = (read_photo(path, _DRAWN_SIZE) for path in paths)
+    if photo0 is None or photo1 is None:
+        return None
+    drawn = draw_matches(
+        (photo0[0], photo1[0]), (photo0[1], photo1[1]), points, kept, max_kept=most[0], max_dropped=most[1]
+    )
+    return jpeg_uri(drawn)
+
+
 def view_graph_scale(pairs: Sequence[PairStatistics]) -> tuple[int, int]:
     """Smallest and largest number of verified matches of a verified pair; (1, 1) without any."""
     counts = [pair.num_verified for pair in pairs if pair.num_verified > 0]
@@ -133,6 +168,32 @@ def draw_view_graph(names: Sequence[str], pairs: Sequence[PairStatistics]) -> ND
     return matrix
 
 
+def draw_shares(names: Sequence[str], pairs: Sequence[tuple[str, str, float | None]]) -> NDArray[np.uint8]:
+    """The matrix of photos by photos, one pixel a pair, by the share of its matches that a model explains.
+
+    Parameters
+    ----------
+    names : sequence of str
+    pairs : sequence of (name, name, share)
+        With a share in [0, 1], or None where the model says nothing about the pair, drawn grey. Other pairs
+        stay white.
+    """
+    position = {name: index for index, name in enumerate(names)}
+    matrix = np.full((len(names), len(names), 3), 255, np.uint8)
+    for name0, name1, share in pairs:
+        row, column = position[name0], position[name1]
+        colour = _MATCHED_GREY if share is None else share_colours(np.array(share))
+        matrix[row, column] = matrix[column, row] = colour
+    return matrix
+
+
+def share_colours(share: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours from red (0) over pale (0.5) to green (1), blue first; the red is darker than the green."""
+    colours = np.array([_bgr(colour) for colour in _SHARE_COLOURS], np.float64)
+    levels = [np.interp(share, (0.0, 0.5, 1.0), colours[:, channel]) for channel in range(3)]
+    return np.stack(levels, axis=-1).round().astype(np.uint8)
+
+
 def shade(level: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Colours from pale (0) to dark (1), in an order that survives any colour vision."""
     values = np.clip(235 - 225 * level, 0, 255).astype(np.uint8)
@@ -140,7 +201,12 @@ def shade(level: NDArray[np.float64]) -> NDArray[np.uint8]:
 
 
 def draw_views(
-    points: NDArray[np.float64], colours: NDArray[np.uint8], centres: NDArray[np.float64], *, side: int = 480
+    points: NDArray[np.float64],
+    colours: NDArray[np.uint8],
+    centres: NDArray[np.float64],
+    frame: tuple[NDArray[np.float64], NDArray[np.float64]],
+    *,
+    side: int = 480,
 ) -> NDArray[np.uint8]:
     """A model from above and from the side, beside each other.
 
@@ -152,12 +218,16 @@ def draw_views(
         Red first.
     centres : (C, 3) float64
         Camera centres, in the same frame.
+    frame : pair of (3,) float64
+        Lowest and highest corner of what is shown; what lies outside is left out.
     side : int
         Pixels of a view.
     """
-    everything = np.vstack([points, centres])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    scale = 0.94 * side / max(float((high - low).max()), 1e-9)
+    low, high = frame
+    inside = np.all((points >= low) & (points <= high), axis=1)
+    points, colours = points[inside], colours[inside]
+    centres = centres[np.all((centres >= low) & (centres <= high), axis=1)]
+    scale = side / max(float((high - low).max()), 1e-9)
     views = []
     for axes in ((0, 1), (0, 2)):
         view = np.full((side, side, 3), 255, np.uint8)

@@ -13,9 +13,25 @@ from corrsfm.graph import connected_components
 from corrsfm.report.missing import MissingPhoto, missing_photos
 from corrsfm.types import ModelSummary, PairStatistics
 
-__all__ = ["SceneReport", "make_report"]
+__all__ = ["SceneReport", "StageWarning", "make_report"]
 
 FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageWarning:
+    """Something that a stage warned of when it was last done.
+
+    Attributes
+    ----------
+    stage : str
+        As in `SceneReport.stage_seconds`, or "report" for what making the report met.
+    message : str
+        May have several lines.
+    """
+
+    stage: str
+    message: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +64,8 @@ class SceneReport:
         empty for models that were taken as they came.
     camera_remarks : tuple of str
         Which photos share a camera and by what evidence, where EXIF did not tell.
+    warnings : tuple of StageWarning
+        In the order of the stages.
     """
 
     scene: str
@@ -61,6 +79,7 @@ class SceneReport:
     versions: dict[str, str]
     evidence: dict[str, Any] = dataclasses.field(default_factory=dict)
     camera_remarks: tuple[str, ...] = ()
+    warnings: tuple[StageWarning, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -70,11 +89,6 @@ class SceneReport:
         verdict = self.evidence["verdict"]
         step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
         return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
-
-    @property
-    def contradicted_pairs(self) -> list[tuple[str, str]]:
-        """Verified pairs that the first model contradicts, the least explained first."""
-        return [(pair["name0"], pair["name1"]) for pair in self.evidence.get("contradicted_pairs", [])]
 
     @property
     def num_registered(self) -> int:
@@ -166,6 +180,7 @@ def make_report(
     versions: Mapping[str, str] | None = None,
     evidence: Mapping[str, Any] | None = None,
     camera_remarks: Iterable[str] = (),
+    warnings: Iterable[StageWarning] = (),
 ) -> SceneReport:
     """Build the report of a scene and find out why photos are missing.
 
@@ -186,6 +201,7 @@ def make_report(
     stage_seconds, configuration, versions, evidence : mapping, optional
         See `SceneReport`.
     camera_remarks : iterable of str, optional
+    warnings : iterable of StageWarning, optional
 
     Returns
     -------
@@ -208,6 +224,7 @@ def make_report(
         versions=dict(versions or {}),
         evidence=dict(evidence or {}),
         camera_remarks=tuple(camera_remarks),
+        warnings=tuple(warnings),
     )
 
 

@@ -54,6 +54,7 @@ svg { display: block; width: 100%; height: auto; }
 svg .bar { fill: var(--bar); }
 svg .grid { stroke: #e6e4dd; }
 svg .frame { fill: none; stroke: var(--line); }
+svg .mark { fill: none; stroke: var(--ink); stroke-linecap: round; }
 svg .tick { font-size: 11px; fill: var(--quiet); }
 svg .axis { font-size: 12.5px; fill: var(--ink); }
 .wide { display: block; width: 100%; height: auto; border-radius: 4px; }
@@ -63,11 +64,20 @@ svg .axis { font-size: 12.5px; fill: var(--ink); }
 .legend i { display: inline-block; width: 14px; height: 14px; vertical-align: -2px; border-radius: 3px;
   margin: 0 4px 0 8px; border: 1px solid rgba(0, 0, 0, .15); }
 .legend i:first-child { margin-left: 0; }
+.crossed { background: #b23a0e; color: #000000; font: bold 14px/12px sans-serif; text-align: center; }
 .grey { background: #dedede; }
 .white { background: #ffffff; }
 summary { cursor: pointer; color: var(--quiet); padding: 6px 0; }
 ol, pre { font-size: .85rem; overflow: auto; max-height: 320px; overflow-wrap: anywhere; }
-.verdict { border-left: 6px solid var(--line); background: var(--card); padding: 12px 16px; margin: 18px 0; }
+.verdict { border-left: 8px solid var(--line); background: var(--card); padding: 14px 18px; margin: 18px 0;
+  overflow-wrap: anywhere; }
+.verdict h2 { font-size: 1.35rem; margin: 0 0 6px; }
+.verdict ul { margin: 0; padding-left: 20px; }
+h3 { font-size: 1rem; margin: 20px 0 4px; }
+.verdict h3 { margin-top: 12px; }
+.lines { white-space: pre-line; overflow-wrap: anywhere; }
+.readout { background: var(--paper); border: 1px solid var(--line); border-radius: 6px; padding: 8px 12px;
+  min-height: 5.2em; overflow-wrap: anywhere; }
 .verdict.good { border-color: #009e73; }
 .verdict.doubtful { border-color: #e69f00; }
 .verdict.wrong { border-color: #d55e00; }

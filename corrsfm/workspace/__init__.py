@@ -9,6 +9,7 @@
     ├── store.py      items in an HDF5 file, written whole
     ├── journal.py    items finished since, each safe at once
     ├── resume.py     what a stage keeps and what it makes again
+    ├── warned.py     what each stage warned of
     └── commands.py   the command that makes a stage again
 """
 

@@ -16,6 +16,7 @@
     ├── sparse/0, 1, …      models, the largest first
     ├── evidence.json       why the first model was chosen, and the verdict on it
     ├── sparse.old/         models of earlier matches, moved here when mapping failed
+    ├── warnings.json       what each stage warned of
     ├── report.json, report.html
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
@@ -117,6 +118,7 @@ class Workspace:
         self.sparse = root / "sparse"
         self.evidence = root / "evidence.json"
         self.candidates = root / ".candidates"
+        self.warnings_json = root / "warnings.json"
         self.report_json = root / "report.json"
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"

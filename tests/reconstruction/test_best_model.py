@@ -1,5 +1,6 @@
 """The first model stays if it convinces; a bent one gives way to the true one, and the record says why."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.reconstruction import best_model
 from corrsfm.reconstruction.agreement import agreement
 from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
+from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.verdict import Grade
 from corrsfm.reconstruction.views import views_of
@@ -125,12 +127,26 @@ def test_candidates_of_an_interrupted_choice_are_not_mapped_again(
 def test_the_record_is_plain_and_tells_the_choice(scene: Scene) -> None:
     selected = scene.select(bent(scene.truth))
     assert selected is not None
-    record = json.loads(json.dumps(record_of(selected), allow_nan=False))
+    record = json.loads(json.dumps(record_of(selected, scene.evidence), allow_nan=False))
     assert record["verdict"]["grade"] == str(selected.verdict.grade)
     assert [model["chosen"] for model in record["models_tried"]].count(True) == 1
     assert record["num_predicted_matches"] == selected.choice.chosen.num_predicted
     assert len(record["pairs"]) == len(scene.evidence.verified)
     assert record["folds"]["left_out"] == []
+
+
+def test_the_record_tells_which_matches_of_contradicted_pairs_are_explained(scene: Scene) -> None:
+    views = views_of(bent(scene.truth))
+    explained = scene.evidence.explain(views)
+    chosen = Tried(name="bent", views=views, explained=explained, seconds=1.0)
+    selected = scene.select(None)
+    assert selected is not None and explained.contradicted
+    choice = dataclasses.replace(selected.choice, chosen=chosen)
+    record = record_of(dataclasses.replace(selected, choice=choice), scene.evidence)
+    for pair in record["contradicted_pairs"][:12]:
+        assert len(pair["explained_matches"]) == pair["num_verified"]
+        assert pair["explained_matches"].count("1") == pair["num_explained"]
+    assert not any("explained_matches" in pair for pair in record["contradicted_pairs"][12:])
 
 
 def test_a_large_scene_spends_less_on_other_models_than_a_small_one() -> None:

@@ -11,9 +11,8 @@ import pycolmap
 import pytest
 
 from corrsfm.colmap.models import summarise_model
-from corrsfm.report import make_report
+from corrsfm.report import StageWarning, make_report
 from corrsfm.report.charts import histogram
-from corrsfm.report.model_view import make_view
 from corrsfm.report.page import write_html
 from corrsfm.report.pictures import draw_matches, draw_view_graph, read_photo, view_graph_scale
 from corrsfm.types import PairStatistics
@@ -215,39 +214,24 @@ def test_histogram_counts_every_value_once() -> None:
     assert re.findall(r"<title>(.*?)</title>", drawn) == ["0 to 1: 1", "1 to 2: 2", "2 or more: 1"]
 
 
-def test_view_is_upright_and_looks_along_y(model) -> None:
-    view = make_view(model)
-    assert view.points.shape == (len(view.colours), 3)
-    assert len(view.names) == len(view.centres) == 4
-    np.testing.assert_allclose(view.frusta[:, 0], view.centres, atol=1e-12)
-    # The upper corners of the pictures are higher than the lower ones, on average over the photos.
-    upper, lower = view.frusta[:, 1:3, 2].mean(), view.frusta[:, 3:5, 2].mean()
-    assert upper > lower
-    # Distances survive the turn.
-    centres = np.array(
-        [image.projection_center() for image in sorted(model.images.values(), key=lambda i: i.name)]
-    )
-    np.testing.assert_allclose(
-        np.linalg.norm(view.centres - view.centres[0], axis=1), np.linalg.norm(centres - centres[0], axis=1)
-    )
-
-
 def test_the_verdict_stands_above_the_numbers_with_what_was_tried(tmp_path: Path) -> None:
     evidence = {
         "verdict": {"grade": "doubtful", "reasons": ["9 of 10 <b>photos"], "next_steps": ["more photos"]},
         "explained_share": 0.9,
         "num_predicted_matches": 12345,
         "models_tried": [{}, {}],
-        "contradicted_pairs": [{"name0": "a.jpg", "name1": "b.jpg"}],
         "folds": {"left_out": [["a.jpg", "b.jpg"]]},
     }
     made = make_report(scene="x", image_names=["a.jpg", "b.jpg"], pairs=[], models=[], evidence=evidence)
     write_html(made, tmp_path / "page.html")
     text = (tmp_path / "page.html").read_text()
-    verdict = '<p class="verdict doubtful"><b>doubtful: 9 of 10 &lt;b&gt;photos; try more photos</b><br>'
+    verdict = (
+        '<div class="verdict doubtful"><h2>The model is doubtful</h2>'
+        "<ul><li>9 of 10 &lt;b&gt;photos</li></ul>"
+        "<h3>What to try next</h3><ul><li>more photos</li></ul>"
+    )
     assert text.index(verdict) < text.index('<div class="tiles">')
     assert "2 models were tried; this one predicts 12,345 matches; 1 pair of look-alike places left" in text
-    assert made.contradicted_pairs == [("a.jpg", "b.jpg")]
     plain = made.to_dict()
     assert plain["verdict"]["grade"] == plain["summary"]["verdict"] == "doubtful"
     assert plain["summary"]["num_predicted_matches"] == 12345
@@ -258,3 +242,30 @@ def test_a_model_that_was_taken_as_it_came_has_no_verdict(tmp_path: Path) -> Non
     write_html(made, tmp_path / "page.html")
     assert '<p class="verdict' not in (tmp_path / "page.html").read_text()
     assert made.to_dict()["verdict"] is None and made.to_dict()["summary"]["verdict"] is None
+
+
+def test_what_the_run_warned_of_is_on_the_page_and_nothing_where_it_did_not(tmp_path: Path) -> None:
+    said = [StageWarning(stage="images", message="ignored a<b>.heic\nconvert it")]
+    made = make_report(scene="x", image_names=["a.jpg", "b.jpg"], pairs=[], models=[], warnings=said)
+    write_html(made, tmp_path / "page.html")
+    assert "<h2>What the run warned of</h2>" in page(tmp_path / "page.html")
+    assert 'images</th><td class="lines">ignored a&lt;b&gt;.heic\nconvert it</td>' in page(
+        tmp_path / "page.html"
+    )
+    assert made.to_dict()["warnings"] == [{"stage": "images", "message": "ignored a<b>.heic\nconvert it"}]
+    quiet = make_report(scene="x", image_names=["a.jpg", "b.jpg"], pairs=[], models=[])
+    write_html(quiet, tmp_path / "page.html")
+    assert "What the run warned of" not in page(tmp_path / "page.html")
+    assert quiet.to_dict()["warnings"] == []
+
+
+def test_pairs_without_a_verified_match_are_counted_and_not_drawn(tmp_path: Path) -> None:
+    def pair(name0: str, name1: str, verified: int) -> PairStatistics:
+        return PairStatistics(name0=name0, name1=name1, num_putative=90, num_kept=40, num_verified=verified)
+
+    pairs = [pair("a", "b", 30), pair("a", "c", 0), pair("b", "c", 0)]
+    write_html(make_report(scene="x", image_names="abc", pairs=pairs, models=[]), tmp_path / "page.html")
+    text = page(tmp_path / "page.html")
+    assert "2 pairs have no verified match and no inlier ratio." in text
+    bars = dict(re.findall(r"<title>([\d.]+ to [\d.]+): (\d+)</title>", text))
+    assert bars["0 to 0.05"] == "0" and bars["0.75 to 0.8"] == "1" and sum(map(int, bars.values())) == 1

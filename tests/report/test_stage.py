@@ -1,14 +1,17 @@
 """The summary of a workspace: only what belongs together."""
 
+import json
 from pathlib import Path
 
 import cv2  # noqa: F401  (before pycolmap)
+import numpy as np
 import pycolmap
 import pytest
 from photos import write_photos
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
+from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.errors import WorkspaceError
 from corrsfm.evaluation.scenes.score import find_model
 from corrsfm.report import MissingReason
@@ -78,3 +81,25 @@ def test_counts_of_a_pair_are_those_of_its_matches(workspace: Workspace) -> None
         key = (pair.name0, pair.name1)
         assert pair.num_putative == len(matches.read(key)) > pair.num_kept
         assert pair.num_kept == len(pruned.read(key).indices) > 0
+
+
+def test_warnings_of_the_stages_and_of_the_report_are_in_the_json(workspace: Workspace) -> None:
+    workspace.warnings_json.write_text(json.dumps({"models": ["late"], "images": ["early"], "gone": ["?"]}))
+    workspace.evidence.write_text("{")
+    pipeline.report(workspace)
+    warnings = json.loads(workspace.report_json.read_text())["warnings"]
+    assert [warning["stage"] for warning in warnings] == ["images", "models", "report"]
+    assert [warning["message"] for warning in warnings[:2]] == ["early", "late"]
+    assert "evidence.json: cannot be read" in warnings[2]["message"]
+    workspace.warnings_json.write_text("{")
+    workspace.evidence.unlink()
+    assert pipeline.report(workspace).warnings == ()
+
+
+def test_verified_matches_of_some_pairs_are_those_of_all(workspace: Workspace) -> None:
+    everything = read_verified_matches(workspace.database)
+    assert everything
+    for pair, matches in everything.items():
+        found = read_verified_matches(workspace.database, [pair, ("gone.png", pair[1])])
+        assert list(found) == [pair]
+        np.testing.assert_array_equal(found[pair], matches)
