@@ -7,6 +7,7 @@ costs nothing.
 
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     open_workspace(folder)                              read what the stages left there
+    export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
     Pruner.load()(pairs)                                prune matches of your own
     correspondences_from_points(points0, points1, …)    such matches, from two arrays and two cameras
     load_network(checkpoint)                            the network itself, tensors in and out
@@ -23,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
+    from corrsfm.export.scene import ExportResult, export_scene
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
     from corrsfm.prune.correspondences import correspondences_from_points
@@ -35,6 +37,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "Correspondences",
+    "ExportResult",
     "Features",
     "Matches",
     "PipelineConfig",
@@ -43,6 +46,7 @@ __all__ = [
     "Scene",
     "__version__",
     "correspondences_from_points",
+    "export_scene",
     "load_network",
     "open_workspace",
     "run_scene",
@@ -51,6 +55,7 @@ __all__ = [
 _HOMES = {
     "Camera": "types",
     "Correspondences": "types",
+    "ExportResult": "export.scene",
     "Features": "types",
     "Matches": "types",
     "PipelineConfig": "config",
@@ -58,6 +63,7 @@ _HOMES = {
     "Pruner": "prune.learned",
     "Scene": "workspace.scene",
     "correspondences_from_points": "prune.correspondences",
+    "export_scene": "export.scene",
     "load_network": "model",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",
