@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ import pycolmap
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.errors import InputError, first_few
+from corrsfm.files import sha256_of
+from corrsfm.images.photos import read_photo_info
 
 __all__ = ["check_photos", "copy_photos", "flat_names", "is_undistortable", "undistort"]
 
@@ -19,20 +21,39 @@ _NUM_BORDER_SAMPLES = 33
 _LARGEST_RETURN_ERROR_PX = 0.5
 
 
-def check_photos(names: Iterable[str], images_dir: Path) -> None:
-    """Refuse to begin if photos are gone.
+def check_photos(model: pycolmap.Reconstruction, images_dir: Path, hashes: Mapping[str, str]) -> None:
+    """Refuse to begin if photos are gone or are not those of the model; COLMAP would abort the process.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    images_dir : Path
+    hashes : mapping of str to str
+        Photo → SHA-256 of the file that was reconstructed. A photo with another hash, such as one with
+        corrected colours, only needs the same size.
 
     Raises
     ------
     InputError
-        Naming them.
+        Naming the photos.
     """
-    missing = [name for name in names if not (images_dir / name).is_file()]
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    missing = [image.name for image in images if not (images_dir / image.name).is_file()]
     if missing:
         raise InputError(
             f"{images_dir}: {len(missing)} photos of the model are not there: {first_few(missing)}; if the "
             "folder was moved, say where it is with --images FOLDER"
         )
+    for image in images:
+        path, camera = images_dir / image.name, model.cameras[image.camera_id]
+        if sha256_of(path) == hashes.get(image.name):
+            continue
+        info = read_photo_info(path)
+        if (info.width, info.height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path}: has {info.width}×{info.height} pixels, but {camera.width}×{camera.height} when it "
+                "was reconstructed; put the photo of that size back, or run the scene again with the new one"
+            )
 
 
 def copy_photos(names: Iterable[str], images_dir: Path, folder: Path) -> None:

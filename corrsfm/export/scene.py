@@ -118,6 +118,7 @@ def export_scene(
     source.require("models")
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
+    index = read_index(source)
     model = read_models(source.sparse)[0]
     names = tuple(poses_of(model))
     if target in _NO_SPACES and (spaced := [name for name in names if " " in name]):
@@ -126,7 +127,7 @@ def export_scene(
             "and reconstruct again"
         )
     if target not in _WITHOUT_PHOTOS:
-        check_photos(names, photos)
+        check_photos(model, photos, {record.name: record.sha256 for record in index.records})
 
     turn = turn_to_z(common_up(poses_of(model).values())) if upright else np.eye(3)
     factor = scale_of(model, *scale) if scale is not None else 1.0
@@ -149,7 +150,7 @@ def export_scene(
         target=target,
         output=path,
         photos=names,
-        left_out=tuple(name for name in read_index(source).names if name not in set(names)),
+        left_out=tuple(name for name in index.names if name not in set(names)),
         num_points=model.num_points3D(),
         num_cropped=num_cropped,
         scale=factor,
