@@ -10,18 +10,17 @@ import click
 from corrsfm.cli.options import echo_json, json_option
 from corrsfm.export import ExportTarget
 
-__all__ = ["export"]
+__all__ = ["NEXT", "export"]
 
 PATH = click.Path(path_type=Path)
 
+_COLMAP = "colmap gui --database_path {}/database.db --image_path {}/images --import_path {}/sparse/0"
 # What to paste next; {} is the output.
-_NEXT = {
+NEXT = {
     ExportTarget.SPLAT: "python train.py -s {}",
     ExportTarget.NERFSTUDIO: "ns-train splatfacto --data {}",
-    ExportTarget.COLMAP: "colmap gui --database_path {}/database.db --image_path {}/images"
-    " --import_path {}/sparse/0",
-    ExportTarget.COLMAP3: "colmap gui --database_path {}/database.db --image_path {}/images"
-    " --import_path {}/sparse/0",
+    ExportTarget.COLMAP: _COLMAP,
+    ExportTarget.COLMAP3: _COLMAP,
     ExportTarget.OPENMVS: "InterfaceCOLMAP -i {} -o {}/scene.mvs",
 }
 
@@ -81,5 +80,5 @@ def export(
     if result.left_out:
         why = shlex.join(["corrsfm", "report", str(workspace_dir)])
         click.echo(f"left out, not in sparse/0: {', '.join(result.left_out)}\nwhy: {why}")
-    if command := _NEXT.get(result.target):
+    if command := NEXT.get(result.target):
         click.echo(f"next: {command.replace('{}', shlex.quote(str(output)))}")
