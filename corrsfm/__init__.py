@@ -5,6 +5,7 @@ costs nothing.
 
 ::
 
+    check_photos(photos)                                what to know of photos before a run
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     open_workspace(folder)                              read what the stages left there
     export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
@@ -25,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
+    from corrsfm.images.check import PhotosCheck, check_photos
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
     from corrsfm.prune.correspondences import correspondences_from_points
@@ -40,11 +42,13 @@ __all__ = [
     "ExportResult",
     "Features",
     "Matches",
+    "PhotosCheck",
     "PipelineConfig",
     "PruneResult",
     "Pruner",
     "Scene",
     "__version__",
+    "check_photos",
     "correspondences_from_points",
     "export_scene",
     "load_network",
@@ -58,10 +62,12 @@ _HOMES = {
     "ExportResult": "export.scene",
     "Features": "types",
     "Matches": "types",
+    "PhotosCheck": "images.check",
     "PipelineConfig": "config",
     "PruneResult": "types",
     "Pruner": "prune.learned",
     "Scene": "workspace.scene",
+    "check_photos": "images.check",
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
     "load_network": "model",

@@ -13,6 +13,7 @@ import click
 from corrsfm import __version__
 from corrsfm.cli.batch import batch
 from corrsfm.cli.bench import bench
+from corrsfm.cli.check import check
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.export import export
@@ -87,7 +88,8 @@ def main(quiet: bool) -> None:
 
 
 _COMMANDS = (
-    run, extract, pairs, match, prune, reconstruct, report, export, batch, compare, evaluate, bench, train,
+    run, extract, pairs, match, prune, reconstruct, report, export, check, batch, compare, evaluate, bench,
+    train,
 )  # fmt: skip
 for _command in _COMMANDS:
     main.add_command(_command)
