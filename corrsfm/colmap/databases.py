@@ -83,6 +83,8 @@ def copy_photos_of(source: Path, target: Path, names: Iterable[str]) -> None:
     DatabaseError
         If the source cannot be read or the target not written.
     """
+    if not source.exists():
+        raise DatabaseError(f"{source}: no such database; try: corrsfm prune WORKSPACE")
     copy_database(source, target)
     with _errors(source), contextlib.closing(sqlite3.connect(target)) as database:
         with database:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -155,7 +156,8 @@ def flat_names(names: Iterable[str]) -> dict[str, str]:
         If two would become one.
     """
     flat = {name: name.replace("/", "_") for name in names}
-    clash = [name for name in flat if list(flat.values()).count(flat[name]) > 1]
+    num = Counter(flat.values())
+    clash = [name for name in flat if num[flat[name]] > 1]
     if clash:
         raise InputError(f"without their folders these photos have one name: {first_few(clash)}; rename one")
     return flat

@@ -12,7 +12,7 @@ import pytest
 from finished_scene import CAMERAS, FinishedScene, make_finished_scene
 
 from corrsfm import export_scene
-from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.errors import DatabaseError, InputError, WorkspaceError
 from corrsfm.export import ExportTarget
 from corrsfm.export.photos import flat_names, is_undistortable
 from corrsfm.workspace import Workspace
@@ -162,6 +162,15 @@ def test_colmap_3_8_does_not_get_a_camera_it_does_not_know(tmp_path: Path, copie
     model.write_binary(copied.workspace / "sparse" / "0")
     with pytest.raises(InputError, match="COLMAP 3.8 does not know the model SIMPLE_DIVISION"):
         export_scene(copied.workspace, tmp_path / "out", "colmap3")
+
+
+@pytest.mark.parametrize("target", ["colmap", "colmap3", "hloc"])
+def test_a_database_that_is_gone_is_not_made_up(copied: FinishedScene, tmp_path: Path, target: str) -> None:
+    (copied.workspace / "database.db").unlink()
+    before = files_in(tmp_path)
+    with pytest.raises(DatabaseError, match="no such database"):
+        export_scene(copied.workspace, tmp_path / "out", target)
+    assert files_in(tmp_path) == before
 
 
 def test_names_with_spaces_are_refused_by_lists_alone(tmp_path: Path) -> None:
