@@ -5,8 +5,10 @@ costs nothing.
 
 ::
 
+    check_photos(photos)                                what to know of photos before a run
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     open_workspace(folder)                              read what the stages left there
+    export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
     Pruner.load()(pairs)                                prune matches of your own
     correspondences_from_points(points0, points1, …)    such matches, from two arrays and two cameras
     load_network(checkpoint)                            the network itself, tensors in and out
@@ -23,6 +25,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
+    from corrsfm.export.scene import ExportResult, export_scene
+    from corrsfm.images.check import PhotosCheck, check_photos
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
     from corrsfm.prune.correspondences import correspondences_from_points
@@ -35,14 +39,18 @@ __version__ = "0.1.0"
 __all__ = [
     "Camera",
     "Correspondences",
+    "ExportResult",
     "Features",
     "Matches",
+    "PhotosCheck",
     "PipelineConfig",
     "PruneResult",
     "Pruner",
     "Scene",
     "__version__",
+    "check_photos",
     "correspondences_from_points",
+    "export_scene",
     "load_network",
     "open_workspace",
     "run_scene",
@@ -51,13 +59,17 @@ __all__ = [
 _HOMES = {
     "Camera": "types",
     "Correspondences": "types",
+    "ExportResult": "export.scene",
     "Features": "types",
     "Matches": "types",
+    "PhotosCheck": "images.check",
     "PipelineConfig": "config",
     "PruneResult": "types",
     "Pruner": "prune.learned",
     "Scene": "workspace.scene",
+    "check_photos": "images.check",
     "correspondences_from_points": "prune.correspondences",
+    "export_scene": "export.scene",
     "load_network": "model",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",

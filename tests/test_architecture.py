@@ -25,7 +25,7 @@ FLOORS: list[tuple[str, set[str]]] = [
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
-    ("a whole run", {"pipeline"}),
+    ("a whole run, and what is handed on after it", {"pipeline", "export"}),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
 ]
@@ -46,10 +46,10 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
 # The rooms that may import a third-party package.
 OWNERS: dict[str, set[str]] = {
     "cv2": {"images", "features", "report", "prune", "evaluation"},
-    "h5py": {"workspace", "labelled"},
+    "h5py": {"workspace", "labelled", "export"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "evaluation",
+        "export", "evaluation",
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},

@@ -13,8 +13,10 @@ import click
 from corrsfm import __version__
 from corrsfm.cli.batch import batch
 from corrsfm.cli.bench import bench
+from corrsfm.cli.check import check
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
+from corrsfm.cli.export import export
 from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.train import train
@@ -85,6 +87,9 @@ def main(quiet: bool) -> None:
         os.environ["TQDM_DISABLE"] = "1"
 
 
-_COMMANDS = (run, extract, pairs, match, prune, reconstruct, report, batch, compare, evaluate, bench, train)
+_COMMANDS = (
+    run, extract, pairs, match, prune, reconstruct, report, export, check, batch, compare, evaluate, bench,
+    train,
+)  # fmt: skip
 for _command in _COMMANDS:
     main.add_command(_command)

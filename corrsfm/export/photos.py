@@ -1,0 +1,163 @@
+"""The photos of a model for another tool: copied as they are, or undistorted to pinhole cameras."""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from corrsfm.colmap.log import colmap_log
+from corrsfm.errors import InputError, first_few
+from corrsfm.files import sha256_of
+from corrsfm.images.photos import read_photo_info
+
+__all__ = ["check_photos", "copy_photos", "flat_names", "is_undistortable", "undistort"]
+
+_JPEG_QUALITY = 95
+_NUM_BORDER_SAMPLES = 33
+_LARGEST_RETURN_ERROR_PX = 0.5
+
+
+def check_photos(model: pycolmap.Reconstruction, images_dir: Path, hashes: Mapping[str, str]) -> None:
+    """Refuse to begin if photos are gone or are not those of the model; COLMAP would abort the process.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    images_dir : Path
+    hashes : mapping of str to str
+        Photo → SHA-256 of the file that was reconstructed. A photo with another hash, such as one with
+        corrected colours, only needs the same size.
+
+    Raises
+    ------
+    InputError
+        Naming the photos.
+    """
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    missing = [image.name for image in images if not (images_dir / image.name).is_file()]
+    if missing:
+        raise InputError(
+            f"{images_dir}: {len(missing)} photos of the model are not there: {first_few(missing)}; if the "
+            "folder was moved, say where it is with --images FOLDER"
+        )
+    for image in images:
+        path, camera = images_dir / image.name, model.cameras[image.camera_id]
+        if sha256_of(path) == hashes.get(image.name):
+            continue
+        info = read_photo_info(path)
+        if (info.width, info.height) != (camera.width, camera.height):
+            raise InputError(
+                f"{path}: has {info.width}×{info.height} pixels, but {camera.width}×{camera.height} when it "
+                "was reconstructed; put the photo of that size back, or run the scene again with the new one"
+            )
+
+
+def copy_photos(names: Iterable[str], images_dir: Path, folder: Path) -> None:
+    """Copy photos, not link them: tools resize in place."""
+    for name in names:
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(images_dir / name, target)
+
+
+def is_undistortable(camera: pycolmap.Camera) -> bool:
+    """Whether a pinhole camera can show all that a camera sees.
+
+    Every pixel of the border must have a ray in front of the camera that leads back to it; the rays of a
+    fisheye beyond 180 degrees, or of distortion that folds over, do not.
+    """
+    steps = np.linspace(0.0, 1.0, _NUM_BORDER_SAMPLES)
+    ends = np.ones_like(steps)
+    unit = np.concatenate(
+        [
+            np.column_stack(side)
+            for side in ((steps, 0 * ends), (steps, ends), (0 * ends, steps), (ends, steps))
+        ]
+    )
+    pixels = unit * [camera.width, camera.height]
+    rays = np.asarray(camera.cam_from_img(pixels))
+    if not np.isfinite(rays).all():
+        return False
+    back = np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+    return bool((np.linalg.norm(back - pixels, axis=1) < _LARGEST_RETURN_ERROR_PX).all())
+
+
+def undistort(model: pycolmap.Reconstruction, images_dir: Path, folder: Path) -> pycolmap.Reconstruction:
+    """Write undistorted photos to ``folder/images``.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        The photos are those of its images.
+    images_dir : Path
+    folder : Path
+        Exists; nothing else is left there.
+
+    Returns
+    -------
+    pycolmap.Reconstruction
+        The model of the undistorted photos: PINHOLE cameras, the same poses and points, keypoints moved.
+
+    Raises
+    ------
+    InputError
+        If a camera cannot be undistorted or a photo cannot be read.
+    """
+    for camera in model.cameras.values():
+        if not is_undistortable(camera):
+            raise InputError(
+                f"camera {camera.camera_id} ({camera.model_name}) cannot be undistorted: it sees more than a "
+                "pinhole camera can show, or its distortion folds over; --for colmap keeps cameras as they "
+                "are, and --for nerfstudio keeps fisheyes"
+            )
+    source, scratch = folder / ".distorted", folder / ".undistorted"
+    source.mkdir()
+    model.write_binary(source)
+    names = sorted(image.name for image in model.images.values())
+    try:
+        with colmap_log():
+            pycolmap.undistort_images(scratch, source, images_dir, jpeg_quality=_JPEG_QUALITY)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(f"{images_dir}: the photos cannot be undistorted ({error})") from error
+    unwritten = [name for name in names if not (scratch / "images" / name).is_file()]
+    if unwritten:
+        raise InputError(
+            f"{images_dir}: COLMAP cannot undistort {first_few(unwritten)}; re-export these photos as JPEG "
+            "or PNG, in the size that was reconstructed"
+        )
+    pinhole = pycolmap.Reconstruction(scratch / "sparse")
+    for camera in pinhole.cameras.values():
+        _as_pinhole(camera)
+    (scratch / "images").rename(folder / "images")
+    shutil.rmtree(source)
+    shutil.rmtree(scratch)
+    return pinhole
+
+
+def _as_pinhole(camera: pycolmap.Camera) -> None:
+    """COLMAP leaves SIMPLE_PINHOLE as it is; OpenMVS reads PINHOLE only."""
+    if camera.model_name == "SIMPLE_PINHOLE":
+        focal, cx, cy = camera.params
+        camera.model = pycolmap.CameraModelId.PINHOLE
+        camera.params = [focal, focal, cx, cy]
+
+
+def flat_names(names: Iterable[str]) -> dict[str, str]:
+    """Names without folders, for tools that look photos up by their last part.
+
+    Raises
+    ------
+    InputError
+        If two would become one.
+    """
+    flat = {name: name.replace("/", "_") for name in names}
+    num = Counter(flat.values())
+    clash = [name for name in flat if num[flat[name]] > 1]
+    if clash:
+        raise InputError(f"without their folders these photos have one name: {first_few(clash)}; rename one")
+    return flat
