@@ -115,10 +115,13 @@ class CompactScene:
         points = normalise_by_pinhole(self.cameras[image], self.keypoints[rows])
         return points + self.corrections[rows] if undistorted else points
 
-    def matched(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keypoint indices of the matches of a pair, within photo 0 and photo 1."""
-        neighbours = self.neighbours[slice(*self.match_offsets[index : index + 2])]
-        found = np.flatnonzero(neighbours != NO_NEIGHBOUR)
+    def matched(
+        self, index: int, *, only_mutual: bool = False
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keypoint indices of the matches of a pair, or of the mutual ones, within photo 0 and photo 1."""
+        rows = slice(*self.match_offsets[index : index + 2])
+        neighbours, mutual = self.neighbours[rows], self.mutual[rows]
+        found = np.flatnonzero((neighbours != NO_NEIGHBOUR) & (mutual | (not only_mutual)))
         return found, neighbours[found].astype(np.int64)
 
     def pair(self, index: int) -> OANetPair:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from corrsfm.colmap.cameras import pinhole_parameters
+from corrsfm.config import MatchInput
 from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
@@ -103,6 +104,8 @@ class RealPairs:
     scene_power : float
         A scene is drawn in proportion to its number of pairs to this power: 0 treats scenes alike, 1 treats
         pairs alike.
+    match_input : MatchInput
+        Matches to yield: all, or the mutual ones.
 
     Attributes
     ----------
@@ -111,7 +114,11 @@ class RealPairs:
     """
 
     def __init__(
-        self, scenes: Sequence[CompactScene | OANetPair], device: torch.device, scene_power: float = 0.5
+        self,
+        scenes: Sequence[CompactScene | OANetPair],
+        device: torch.device,
+        scene_power: float = 0.5,
+        match_input: MatchInput = MatchInput.ALL,
     ) -> None:
         self.device = device
         names = [scene.name if isinstance(scene, CompactScene) else scene.scene for scene in scenes]
@@ -121,14 +128,14 @@ class RealPairs:
         num_keys = num_matches = 0
         for name, scene in zip(names, scenes, strict=True):
             if isinstance(scene, CompactScene):
-                arrays = _flatten_scene(scene, num_keys, num_matches)
+                arrays = _flatten_scene(scene, num_keys, num_matches, match_input)
             else:
-                arrays = _flatten_pair(scene, num_keys, num_matches)
+                arrays = _flatten_pair(scene, num_keys, num_matches, match_input)
             arrays["scene"] = np.full(len(arrays["matrix"]), number[name])
             for key, values in arrays.items():
                 parts.setdefault(key, []).append(values)
             num_keys += len(arrays["points"])
-            num_matches += len(arrays["key1"])
+            num_matches += len(arrays["key0"])
         if not parts:
             raise InputError("no scene to train on")
         self._arrays = {
@@ -139,12 +146,18 @@ class RealPairs:
         self._weights = self._pair_weights(num_inliers, scene_power)
 
     @classmethod
-    def from_files(cls, paths: Sequence[Path], device: torch.device, scene_power: float = 0.5) -> RealPairs:
+    def from_files(
+        cls,
+        paths: Sequence[Path],
+        device: torch.device,
+        scene_power: float = 0.5,
+        match_input: MatchInput = MatchInput.ALL,
+    ) -> RealPairs:
         """Read compact files and files in OANet's layout; see the class."""
         scenes: list[CompactScene | OANetPair] = []
         for path in paths:
             scenes.extend(read_scenes(path) if is_compact(path) else read_pairs(path))
-        return cls(scenes, device, scene_power)
+        return cls(scenes, device, scene_power, match_input)
 
     def _count_inliers(self) -> tuple[Tensor, Tensor]:
         ratios, counts = [], []
@@ -214,13 +227,16 @@ class RealPairs:
         return augment(batch, guess, config, generator)
 
 
-def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str, np.ndarray]:
+def _flatten_pair(
+    pair: OANetPair, first_key: int, first_match: int, match_input: MatchInput
+) -> dict[str, np.ndarray]:
     """Arrays of a pair in OANet's layout; its keypoints are those of image 0, then of image 1."""
     num = len(pair)
     zeros = np.zeros(num, np.float32)
     # YFCC100M has more keypoints than 32 bits can count.
     dtype = np.int32 if first_key + 2 * num < 2**31 else np.int64
-    rows = first_key + np.arange(num)
+    read = np.flatnonzero(pair.mutual) if match_input is MatchInput.MUTUAL else np.arange(num)
+    rows = first_key + read
     return {
         "points": pair.correspondences.reshape(num, 2, 2).transpose(1, 0, 2).reshape(-1, 2),
         "corrections": np.zeros((2 * num, 2), np.float32),
@@ -228,20 +244,23 @@ def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str
         "orientations": np.concatenate([zeros, pair.rotations]),
         "key0": rows.astype(dtype),
         "key1": (rows + num).astype(dtype),
-        "ratios": quantise_ratios(pair.ratios),
-        "mutual": pair.mutual,
-        "num_matches": np.array([num]),
+        "ratios": quantise_ratios(pair.ratios[read]),
+        "mutual": pair.mutual[read],
+        "num_matches": np.array([len(read)]),
         "match_start": np.array([first_match]),
         "guess": np.ones((1, 2), np.float32),
         "matrix": essential_from_pose(pair.rotation, pair.translation)[None].astype(np.float32),
     }
 
 
-def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dict[str, np.ndarray]:
+def _flatten_scene(
+    scene: CompactScene, first_key: int, first_match: int, match_input: MatchInput
+) -> dict[str, np.ndarray]:
     """Arrays of a scene with indices into the concatenation of all scenes."""
     images = range(len(scene.image_names))
     points = [scene.normalised(image, undistorted=False) for image in images]
-    found = [scene.matched(index) for index in range(len(scene.pairs))]
+    only_mutual = match_input is MatchInput.MUTUAL
+    found = [scene.matched(index, only_mutual=only_mutual) for index in range(len(scene.pairs))]
     counts = np.array([len(index0) for index0, _ in found], np.int64)
     matched = [scene.match_offsets[index] + index0 for index, (index0, _) in enumerate(found)]
     rows = np.concatenate(matched) if matched else np.zeros(0, np.int64)

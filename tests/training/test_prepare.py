@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from corrsfm.config import MatchInput
 from corrsfm.errors import ConfigError, InputError
 from corrsfm.labelled.compact import read_scenes
 from corrsfm.labelled.oanet import read_pairs
@@ -158,6 +159,12 @@ def test_the_second_part_of_the_small_recipe_continues_the_first(repository):
     assert Path(second.train.initial) == first.train.output / "latest.pt"
     assert second.network == {}
     assert second.train.train_files == first.train.train_files
+
+
+def test_the_mutual_recipe_reads_mutual_matches_and_continues_a_network(repository):
+    recipe = load_recipe(repository / "pipelines" / "train_mutual.toml")
+    assert recipe.train.input is MatchInput.MUTUAL
+    assert recipe.train.initial and recipe.network == {}
 
 
 def test_a_recipe_with_an_unknown_key_is_refused(tmp_path):
