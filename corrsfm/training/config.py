@@ -37,6 +37,9 @@ class PrepareConfig:
     max_pairs_per_scene: int = option(
         0, "Most pairs of a scene, spread evenly over its range of shared points; 0 for all", minimum=0
     )
+    negatives: int = option(
+        0, "Most pairs of a scene that share nothing, added to learn from as all wrong", minimum=0
+    )
     seed: int = option(0, "Seed of the choice of pairs", minimum=0)
 
 
@@ -92,6 +95,9 @@ class TrainConfig:
     initial: str = option("", "Checkpoint, or name of a bundled one, whose weights the run starts from")
     input: MatchInput = option(
         MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
+    )
+    negative_share: float = option(
+        0.0, "Share of real pairs that show two places, all wrong", minimum=0, maximum=0.9
     )
     synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0)
     batch_size: int = option(32, "Pairs in a batch, on each device", minimum=1)

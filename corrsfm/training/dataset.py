@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -48,6 +49,8 @@ class Batch:
         Side information before it becomes channels.
     mask : (B, N) bool
         False for padding.
+    related : (B,) bool
+        False for photos of two places, whose matches are all wrong.
     """
 
     correspondences: Tensor
@@ -58,10 +61,12 @@ class Batch:
     log_scale_ratios: Tensor
     rotations: Tensor
     mask: Tensor
+    related: Tensor
 
     def distances(self) -> Tensor:
-        """Squared symmetric epipolar distances (B, N) to the truth."""
-        return symmetric_epipolar_squared(self.true_correspondences, self.matrix)
+        """Squared symmetric epipolar distances (B, N) to the truth; infinite where two places are shown."""
+        distances = symmetric_epipolar_squared(self.true_correspondences, self.matrix)
+        return distances.masked_fill(~self.related[:, None], torch.inf)
 
     def inliers(self) -> Tensor:
         """Matches (B, N) that agree with the truth; False for padding."""
@@ -106,6 +111,8 @@ class RealPairs:
         pairs alike.
     match_input : MatchInput
         Matches to yield: all, or the mutual ones.
+    negative_share : float
+        Share of drawn pairs that show two places.
 
     Attributes
     ----------
@@ -119,6 +126,7 @@ class RealPairs:
         device: torch.device,
         scene_power: float = 0.5,
         match_input: MatchInput = MatchInput.ALL,
+        negative_share: float = 0.0,
     ) -> None:
         self.device = device
         names = [scene.name if isinstance(scene, CompactScene) else scene.scene for scene in scenes]
@@ -144,20 +152,18 @@ class RealPairs:
         self.num_pairs = len(self._arrays["scene"])
         self.inlier_ratios, num_inliers = self._count_inliers()
         self._weights = self._pair_weights(num_inliers, scene_power)
+        if negative_share > 0:
+            negatives = self._negative_weights(scene_power)
+            self._weights = (1 - negative_share) * self._weights / self._weights.sum()
+            self._weights += negative_share * negatives / negatives.sum()
 
     @classmethod
-    def from_files(
-        cls,
-        paths: Sequence[Path],
-        device: torch.device,
-        scene_power: float = 0.5,
-        match_input: MatchInput = MatchInput.ALL,
-    ) -> RealPairs:
-        """Read compact files and files in OANet's layout; see the class."""
+    def from_files(cls, paths: Sequence[Path], device: torch.device, **options: Any) -> RealPairs:
+        """Read compact files and files in OANet's layout; the options are those of the class."""
         scenes: list[CompactScene | OANetPair] = []
         for path in paths:
             scenes.extend(read_scenes(path) if is_compact(path) else read_pairs(path))
-        return cls(scenes, device, scene_power, match_input)
+        return cls(scenes, device, **options)
 
     def _count_inliers(self) -> tuple[Tensor, Tensor]:
         ratios, counts = [], []
@@ -185,6 +191,18 @@ class RealPairs:
         share = 0.5 / (per_cell[cell] * levels[scene]).clamp(min=1) + 0.5 / per_scene[scene].clamp(min=1)
         return torch.where(usable, share * per_scene[scene] ** scene_power, 0.0)
 
+    def _negative_weights(self, scene_power: float) -> Tensor:
+        scene, negative = self._arrays["scene"], ~self._arrays["related"]
+        # Matches, too: a network cannot read a pair of none.
+        negative = negative & (self._arrays["num_matches"] >= _MIN_INLIERS)
+        if not negative.any():
+            raise InputError(
+                "no pair of photos that share nothing, but negative_share is above 0; "
+                "make some with: corrsfm train prepare --negatives"
+            )
+        per_scene = torch.bincount(scene[negative], minlength=len(self.scene_names)).double()
+        return torch.where(negative, per_scene[scene].clamp(min=1) ** (scene_power - 1), 0.0)
+
     def _gather(self, pairs: Tensor, columns: Tensor) -> Batch:
         """Matches ``columns`` (B, N) of ``pairs`` (B,); columns beyond a pair's matches are padding."""
         a = self._arrays
@@ -201,6 +219,7 @@ class RealPairs:
             log_scale_ratios=(a["log_scales"][key1] - a["log_scales"][key0]).float(),
             rotations=a["orientations"][key1] - a["orientations"][key0],
             mask=mask,
+            related=a["related"][pairs],
         )
 
     def sample(
@@ -247,6 +266,7 @@ def _flatten_pair(
         "ratios": quantise_ratios(pair.ratios[read]),
         "mutual": pair.mutual[read],
         "num_matches": np.array([len(read)]),
+        "related": np.array([True]),
         "match_start": np.array([first_match]),
         "guess": np.ones((1, 2), np.float32),
         "matrix": essential_from_pose(pair.rotation, pair.translation)[None].astype(np.float32),
@@ -293,6 +313,7 @@ def _flatten_scene(
         "ratios": quantise_ratios(scene.ratios[rows]),
         "mutual": scene.mutual[rows],
         "num_matches": counts,
+        "related": scene.covisible > 0,
         "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
         "guess": np.array(guesses, np.float32),
         "matrix": np.array(matrices, np.float32),
@@ -365,6 +386,7 @@ def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch
         log_scale_ratios=batch.log_scale_ratios * sign,
         rotations=rotations * sign,
         mask=batch.mask,
+        related=batch.related,
     )
 
 

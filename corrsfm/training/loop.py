@@ -76,7 +76,13 @@ def train(
         )
     with _process_group(torch.device(device)) as (rank, own_device):
         options = recipe.train
-        data = RealPairs.from_files(options.train_files, own_device, options.scene_power, options.input)
+        data = RealPairs.from_files(
+            options.train_files,
+            own_device,
+            scene_power=options.scene_power,
+            match_input=options.input,
+            negative_share=options.negative_share,
+        )
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
         if trainer.state_path.exists():
             if not resume:
@@ -283,8 +289,12 @@ class Trainer:
         logits = [logits.float() for logits in output.logits]
         total = classification_loss(logits, steps, masks, self.config.threshold)
         parts = {"classification": float(total.detach())}
-        if with_essential:
-            essential = essential_loss(output.essential.float(), virtual_points(batch.matrix))
+        related = batch.related
+        if with_essential and bool(related.any()):
+            # Photos of two places have no matrix to find.
+            essential = essential_loss(
+                output.essential.float()[related], virtual_points(batch.matrix[related])
+            )
             total = total + self.config.essential_weight * essential
             parts["essential"] = float(essential.detach())
         return total, parts

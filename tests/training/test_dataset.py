@@ -8,6 +8,7 @@ import torch
 from labelled_scene import make_scene
 
 from corrsfm.config import MatchInput
+from corrsfm.errors import InputError
 from corrsfm.prune import correspondences
 from corrsfm.training.config import NO_AUGMENTATION, AugmentConfig
 from corrsfm.training.dataset import RealPairs, augment, generator_for, side_information
@@ -118,6 +119,29 @@ def test_mutual_input_yields_the_mutual_matches_of_either_layout():
             np.testing.assert_allclose(batch.ratios[0, :num], pair.ratios[pair.mutual], atol=3e-3)
             rotations = batch.rotations[0, :num].numpy() - pair.rotations[pair.mutual]
             np.testing.assert_allclose(np.cos(rotations), 1, atol=1e-5)
+
+
+def with_negatives(scene, num):
+    """The scene with its first pairs marked as showing two places."""
+    covisible = scene.covisible.copy()
+    covisible[:num] = 0
+    return dataclasses.replace(scene, covisible=covisible)
+
+
+def test_negatives_are_all_wrong_and_drawn_as_often_as_asked():
+    scenes = [with_negatives(make_scene("a"), 2), with_negatives(make_scene("b", seed=1), 1)]
+    data = RealPairs(scenes, CPU, negative_share=0.25)
+    batch = data.sample(400, 32, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    assert 0.18 < float((~batch.related).float().mean()) < 0.32
+    assert not batch.inliers()[~batch.related].any()
+    assert batch.inliers()[batch.related].any(1).all()
+    never = RealPairs(scenes, CPU).sample(400, 32, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    assert never.related.all()
+
+
+def test_a_share_of_negatives_without_any_is_refused():
+    with pytest.raises(InputError, match="train prepare --negatives"):
+        RealPairs([make_scene("a")], CPU, negative_share=0.1)
 
 
 def test_batches_depend_on_seed_step_and_rank_only(data):

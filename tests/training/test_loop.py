@@ -64,6 +64,18 @@ def test_overfits_one_batch_of_mutual_matches(tmp_path):
         Trainer(make_recipe(tmp_path), data, CPU).load()
 
 
+def test_a_batch_of_photos_of_two_places_only_has_a_finite_loss(data, tmp_path):
+    trainer = Trainer(make_recipe(tmp_path, essential_start=0.0), data, CPU)
+    batch = trainer.draw(0)
+    for related in ([False] * 4, [True, False, False, True]):
+        mixed = dataclasses.replace(batch, related=torch.tensor(related))
+        trainer.draw = lambda step, mixed=mixed: mixed  # type: ignore[method-assign]
+        losses = trainer.train_step(0.9)
+        assert math.isfinite(losses["loss"]) and math.isfinite(losses["gradient"])
+        assert ("essential" in losses) == any(related)
+    assert trainer.num_skipped == 0
+
+
 def test_synthetic_pairs_are_not_for_a_network_of_mutual_matches(tmp_path):
     recipe = make_recipe(tmp_path, input=MatchInput.MUTUAL, synthetic_share=0.5)
     with pytest.raises(ConfigError, match="synthetic_share to 0"):
