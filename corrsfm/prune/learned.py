@@ -125,12 +125,12 @@ class Pruner:
     -----
     What a pair is batched with, the processor and the number of its threads change a result by rounding
     only. A pair at a time, as by default on a CPU, repeats itself bit by bit on one machine. Otherwise the
-    network's neighbours flip where they almost tie: see `corrsfm.model.network`. With the bundled checkpoint,
-    float32 in five orders of summation against float64 on 90 validation pairs of 2,000 matches: a neighbour
-    flips in a third of the 450 runs. The score that changes most in a pair changes by 1e-5 in the median, by
-    more than 1e-3 in a tenth of the runs, by 0.05 at worst. Of 130,865 matches kept at the operating point
-    ``pose`` one changes sides, of 129,860 at ``sfm`` none. An untrained network is less steady: scores change
-    by up to 0.3, and kept matches in a tenth of the runs.
+    network's neighbours flip where they almost tie: see `corrsfm.model.network`. With the checkpoint
+    that was bundled first and read all matches, float32 in five orders of summation against float64 on 90
+    validation pairs of 2,000 matches: a neighbour flips in a third of the 450 runs. The score that changes
+    most in a pair changes by 1e-5 in the median, by more than 1e-3 in a tenth of the runs, by 0.05 at worst.
+    Of 130,865 matches kept at the operating point ``pose`` one changes sides, of 129,860 at ``sfm`` none. An
+    untrained network is less steady: scores change by up to 0.3, and kept matches in a tenth of the runs.
     """
 
     name = "corradaptor"
