@@ -196,6 +196,8 @@ class Correspondences:
         The cameras that ``normalised`` was made with.
     name : str
         ``"name0 – name1"`` for messages.
+    mutual_known : bool
+        False if ``mutual`` only stands in for what nobody said.
     """
 
     points0: NDArray[np.float32]
@@ -208,6 +210,7 @@ class Correspondences:
     camera0: Camera
     camera1: Camera
     name: str = ""
+    mutual_known: bool = True
 
     def __post_init__(self) -> None:
         num = len(self.points0)

@@ -96,10 +96,10 @@ def readme_example(repository: Path) -> str:
 def test_the_readmes_python_keeps_inliers_and_drops_outliers(repository: Path) -> None:
     code = readme_example(repository)
     assert len(code.strip().splitlines()) <= 10
-    pair = make_pair(seed=0, num=400, inlier_ratio=0.5)
+    pair = make_pair(seed=0, num=400, inlier_ratio=0.5, relief=True)
     # Through the camera of the example: 1920 px focal length, 1600 × 1200 px.
     points = pair.as_correspondences().normalised * 1920.0 + np.tile([800.0, 600.0], 2)
-    names = {"points0": points[:, :2], "points1": points[:, 2:], "ratios": pair.ratios}
+    names = {"points0": points[:, :2], "points1": points[:, 2:], "ratios": pair.ratios, "mutual": pair.mutual}
     exec(compile(code, "README.md", "exec"), names)
     kept, right = names["kept"], pair.label_distances < 1e-9
     assert kept.shape == (400,) and kept.dtype == bool

@@ -28,6 +28,7 @@ __all__ = [
     "pipeline_options",
     "recipe_options",
     "run_options",
+    "usage_options",
 ]
 
 # Set in the context of an invocation with --overwrite.
@@ -205,6 +206,21 @@ def _warn_of_idle(config: Any, given: Collection[str]) -> None:
 def run_options(command: F) -> F:
     """``--seed``, ``--device`` and ``--threads``; the command is called with ``run=RunConfig(...)``."""
     return config_options(run=cfg.RunConfig)(command)
+
+
+def usage_options(command: F) -> F:
+    """A flag for every field of a checkpoint's usage.
+
+    The command is called with ``adjust``, which overrides a `NetworkUsage` by the flags that the user typed.
+    """
+    names = [entry.name for entry in dataclasses.fields(cfg.NetworkUsage)]
+
+    @functools.wraps(command)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        values = {name: kwargs.pop(name) for name in names}
+        return command(*args, adjust=lambda usage: _override(usage, dict(values)), **kwargs)
+
+    return typing.cast(F, _with_flags(wrapped, [cfg.NetworkUsage]))
 
 
 def overwrite_option(command: F) -> F:

@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from corrsfm.cli.options import config_options, recipe_options
+from corrsfm.cli.options import config_options, recipe_options, usage_options
 from corrsfm.training.config import PrepareConfig
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from corrsfm.config import NetworkUsage
     from corrsfm.training.config import TrainRecipe
 
 __all__ = ["train"]
@@ -85,15 +88,23 @@ def _echo_row(row: dict[str, Any]) -> None:
 
 
 @train.command()
-@click.argument("run_folder", metavar="RUN", type=PATH)
+@click.argument("source", metavar="RUN", type=PATH)
 @click.argument("output", type=PATH)
 @click.option("--half/--no-half", default=True, show_default=True, help="Store in half precision.")
-def export(run_folder: Path, output: Path, half: bool) -> None:
-    """Write the averaged weights of RUN as a checkpoint for `corrsfm prune`."""
+@usage_options
+def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsage], NetworkUsage]) -> None:
+    """Write the averaged weights of RUN as a checkpoint for `corrsfm prune`.
+
+    RUN may also be a checkpoint, of this project or published, that lacks a property: what it reads and its
+    operating points stay as they are but for the flags given here; the defaults are those of a checkpoint
+    that says nothing.
+    """
     from corrsfm.model import load_network, read_provenance, save_network
 
-    source = run_folder / "latest.pt"
-    digest = save_network(load_network(source), output, provenance=read_provenance(source), half=half)
+    checkpoint = source / "latest.pt" if source.is_dir() else source
+    network = load_network(checkpoint, architecture="corradaptor")
+    network.usage = adjust(network.usage)
+    digest = save_network(network, output, provenance=read_provenance(checkpoint), half=half)
     click.echo(f"{output}  sha256 {digest}")
 
 

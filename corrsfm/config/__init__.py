@@ -20,6 +20,7 @@ from corrsfm.config.stages import (
     RunConfig,
     load_pipeline,
 )
+from corrsfm.config.usage import MatchInput, NetworkUsage
 
 __all__ = [
     "LARGEST_INT",
@@ -29,7 +30,9 @@ __all__ = [
     "FeaturesConfig",
     "ImagesConfig",
     "Mapper",
+    "MatchInput",
     "MatchesConfig",
+    "NetworkUsage",
     "OperatingPoint",
     "PairStrategy",
     "PairsConfig",

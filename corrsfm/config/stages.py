@@ -199,7 +199,7 @@ class PruneConfig:
     )
     max_candidates: int = option(
         2000,
-        "Matches per pair that the network sees, best ratio first",
+        "Matches per pair that the network sees, of the kind that it reads, best ratio first",
         minimum=16,
         used_with=_NETWORK,
     )

@@ -18,7 +18,8 @@ corrections         (K, 2) float16      undistorted minus pinhole normalised coo
 log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels
 orientations        (K,) uint16         orientation in units of a turn / 65536
 pairs               (P, 2) uint16       photo indices
-covisible           (P,) int32          shared points of the reconstruction
+covisible           (P,) int32          shared points of the reconstruction; 0 marks a negative: two places,
+                                        all matches wrong
 match_offsets       (P+1,) int64        rows of each pair in the next two
 neighbours          (M,) uint16         for each keypoint of image 0 its nearest in image 1; 65535 for none
 ratios              (M,) uint8          ratio of the two nearest descriptor distances in units of 1/255
@@ -115,17 +116,20 @@ class CompactScene:
         points = normalise_by_pinhole(self.cameras[image], self.keypoints[rows])
         return points + self.corrections[rows] if undistorted else points
 
-    def matched(self, index: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Keypoint indices of the matches of a pair, within photo 0 and photo 1."""
-        neighbours = self.neighbours[slice(*self.match_offsets[index : index + 2])]
-        found = np.flatnonzero(neighbours != NO_NEIGHBOUR)
+    def matched(
+        self, index: int, *, only_mutual: bool = False
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Keypoint indices of the matches of a pair, or of the mutual ones, within photo 0 and photo 1."""
+        rows = slice(*self.match_offsets[index : index + 2])
+        neighbours, mutual = self.neighbours[rows], self.mutual[rows]
+        found = np.flatnonzero((neighbours != NO_NEIGHBOUR) & (mutual | (not only_mutual)))
         return found, neighbours[found].astype(np.int64)
 
     def pair(self, index: int) -> OANetPair:
         """One pair with its label distances.
 
         The correspondences are normalised by the pinhole part of the cameras, as a user would know them; the
-        distances to the true epipolar lines use the full model.
+        distances to the true epipolar lines use the full model. Those of a negative are infinite.
         """
         image0, image1 = (int(image) for image in self.pairs[index])
         index0, index1 = self.matched(index)
@@ -147,11 +151,12 @@ class CompactScene:
         )
         key0, key1 = self.keypoint_offsets[image0] + index0, self.keypoint_offsets[image1] + index1
         turn = self.orientations[key1] - self.orientations[key0]
+        distances = symmetric_epipolar_distance_sq(essential_from_pose(rotation, translation), true)
+        if self.covisible[index] == 0:
+            distances = np.full_like(distances, np.inf)
         return OANetPair(
             correspondences=known.astype(np.float32),
-            label_distances=symmetric_epipolar_distance_sq(
-                essential_from_pose(rotation, translation), true
-            ).astype(np.float32),
+            label_distances=distances.astype(np.float32),
             rotation=rotation,
             translation=translation / max(float(np.linalg.norm(translation)), 1e-12),
             ratios=self.ratios[rows],
@@ -282,7 +287,7 @@ def read_scenes(path: Path) -> list[CompactScene]:
 def read_labelled_pairs(
     path: Path, *, num_per_scene: int | None = None, seed: int = 0
 ) -> Iterator[OANetPair]:
-    """Read the pairs of a compact file one by one.
+    """Read the pairs of a compact file one by one, but for the negatives, which have no pose to find.
 
     Parameters
     ----------
@@ -293,8 +298,9 @@ def read_labelled_pairs(
         Seed of the draw.
     """
     for scene in read_scenes(path):
-        indices: Iterable[int] = range(len(scene.pairs))
+        related = np.flatnonzero(scene.covisible > 0)
+        chosen: Iterable[int] = range(len(related))
         if num_per_scene is not None:
-            indices = select_per_scene([scene.name] * len(scene.pairs), num_per_scene, seed)
-        for index in indices:
-            yield scene.pair(index)
+            chosen = select_per_scene([scene.name] * len(related), num_per_scene, seed)
+        for index in chosen:
+            yield scene.pair(int(related[index]))

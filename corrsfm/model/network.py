@@ -36,6 +36,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from corrsfm.config import NetworkUsage
 from corrsfm.errors import ConfigError
 
 __all__ = [
@@ -803,6 +804,8 @@ class CorrAdaptor(nn.Module):
     """
 
     config: NetworkConfig | None = None
+    # Goes with the weights into a checkpoint; the layers do not read it.
+    usage: NetworkUsage = NetworkUsage()
 
     def __init__(
         self,

@@ -20,8 +20,8 @@ __all__ = ["ENOUGH", "TOO_FEW", "CascadePruner"]
 ENOUGH = 100
 """Ratio-tested mutual matches from which on the network is not asked.
 
-On the 134 pairs above, pose AUC@5° was 90.2 with the ratio test and 89.9 with the network; on the 106 below,
-36.7 and 42.8.
+On the 134 pairs above, pose AUC@5° was 90.2 with the ratio test and 89.9 with the network that was bundled
+first; on the 106 below, 36.7 and 42.8.
 """
 
 TOO_FEW = 15

@@ -86,7 +86,8 @@ def correspondences_from_points(
     """Putative matches of your own, from any detector, for a prune method.
 
     What is unknown about a match takes a neutral value: `UNKNOWN_RATIO`, mutual, no change of scale and no
-    rotation between the photos. The bundled network prunes less well without it.
+    rotation between the photos. Networks prune less well without it, and one that reads mutual matches only
+    asks for ``mutual``.
 
     Parameters
     ----------
@@ -135,6 +136,7 @@ def correspondences_from_points(
         camera0=cameras[0],
         camera1=cameras[1],
         name=name,
+        mutual_known=mutual is not None,
     )
 
 

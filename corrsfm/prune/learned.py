@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from corrsfm.config import OperatingPoint, Precision, PruneConfig
+from corrsfm.config import MatchInput, OperatingPoint, Precision, PruneConfig, to_dict
 from corrsfm.errors import CorrsfmError
 from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.robust import normalised_residuals
-from corrsfm.prune.selection import score_matches, select_candidates, select_kept
+from corrsfm.prune.selection import readable_matches, score_matches, select_candidates, select_kept
 from corrsfm.types import Correspondences, PruneResult, TwoViewModel
 
 __all__ = ["Pruner", "choose_precision", "pack_batches"]
@@ -99,7 +99,8 @@ class Pruner:
     Parameters
     ----------
     network : CorrAdaptor
-        Is moved to the device and put into evaluation mode.
+        Is moved to the device and put into evaluation mode. Its ``usage`` says which matches it reads and
+        which scores keep one.
     checkpoint_sha256 : str
         Where the network's weights come from, for `fingerprint`.
     device : str
@@ -107,8 +108,8 @@ class Pruner:
     operating_point : OperatingPoint
         See `corrsfm.prune.selection.select_kept`.
     max_candidates : int
-        Matches of a pair that the network sees, smallest ratio first. Its essential matrix is verified on
-        all putative matches.
+        Matches of a pair that the network sees, of those it reads, smallest ratio first. Its essential matrix
+        is verified on all putative matches.
     max_batch_matches : int
         Bound of the matches in a batch, padding included; bounds memory.
     precision : Precision
@@ -124,12 +125,12 @@ class Pruner:
     -----
     What a pair is batched with, the processor and the number of its threads change a result by rounding
     only. A pair at a time, as by default on a CPU, repeats itself bit by bit on one machine. Otherwise the
-    network's neighbours flip where they almost tie: see `corrsfm.model.network`. With the bundled checkpoint,
-    float32 in five orders of summation against float64 on 90 validation pairs of 2,000 matches: a neighbour
-    flips in a third of the 450 runs. The score that changes most in a pair changes by 1e-5 in the median, by
-    more than 1e-3 in a tenth of the runs, by 0.05 at worst. Of 130,865 matches kept at the operating point
-    ``pose`` one changes sides, of 129,860 at ``sfm`` none. An untrained network is less steady: scores change
-    by up to 0.3, and kept matches in a tenth of the runs.
+    network's neighbours flip where they almost tie: see `corrsfm.model.network`. With the checkpoint
+    that was bundled first and read all matches, float32 in five orders of summation against float64 on 90
+    validation pairs of 2,000 matches: a neighbour flips in a third of the 450 runs. The score that changes
+    most in a pair changes by 1e-5 in the median, by more than 1e-3 in a tenth of the runs, by 0.05 at worst.
+    Of 130,865 matches kept at the operating point ``pose`` one changes sides, of 129,860 at ``sfm`` none. An
+    untrained network is less steady: scores change by up to 0.3, and kept matches in a tenth of the runs.
     """
 
     name = "corradaptor"
@@ -153,6 +154,7 @@ class Pruner:
         self._num_threads = count_threads(threads)
         self._batched = self.device.type != "cpu" if batched is None else batched
         self._side_channels = network.side_channels
+        self._usage = network.usage
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
         self._network: Callable = network.to(self.device).eval()
         if compile:
@@ -161,9 +163,10 @@ class Pruner:
         self._max_candidates = max_candidates
         self._max_batch_matches = max_batch_matches
         self._warned = False
+        usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage).items())
         self.fingerprint = (
             f"corradaptor-3 sha256={checkpoint_sha256} operating_point={operating_point} "
-            f"max_candidates={max_candidates} dtype={self.dtype}"
+            f"max_candidates={max_candidates} dtype={self.dtype} {usage}"
         )
 
     @classmethod
@@ -191,23 +194,33 @@ class Pruner:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.
 
         Scores are the network's probabilities that a match is right, from the last round that judged it;
-        see `corrsfm.prune.selection.score_matches` for matches that it did not see. Pairs with fewer than 32
-        matches (for the published pruning ratio) get scores but no model.
-        """
-        self._guard(pairs)
-        candidates = [select_candidates(pair, self._max_candidates) for pair in pairs]
-        estimates = self._estimate(pairs, candidates)
-        return [self._result(pair, estimate) for pair, estimate in zip(pairs, estimates, strict=True)]
+        see `corrsfm.prune.selection.score_matches` for matches that it did not see, and 0 for those of a kind
+        that it does not read. Pairs with fewer than 32 matches to read (for the published pruning ratio) get
+        scores but no model.
 
-    def _result(self, pair: Correspondences, estimate: NetworkEstimate) -> PruneResult:
+        Raises
+        ------
+        InputError
+            If the network reads mutual matches and a pair does not say which of its matches are.
+        """
+        candidates = [select_candidates(pair, self._max_candidates, self._usage.input) for pair in pairs]
+        self._guard(pairs)
+        estimates = self._estimate(pairs, candidates)
+        return [
+            self._result(pair, len(rows), estimate)
+            for pair, rows, estimate in zip(pairs, candidates, estimates, strict=True)
+        ]
+
+    def _result(self, pair: Correspondences, num_candidates: int, estimate: NetworkEstimate) -> PruneResult:
         model, residuals = None, np.full(len(pair), np.inf, np.float32)
         if estimate.essential is not None:
             model = TwoViewModel(kind="essential", matrix=estimate.essential)
             residuals = normalised_residuals(model, pair)
         scores = score_matches(estimate.logits, residuals)
+        scores[~readable_matches(pair, self._usage.input)] = 0
         return PruneResult(
             scores=scores,
-            inlier_mask=select_kept(pair, scores, self._operating_point),
+            inlier_mask=select_kept(pair, scores, self._operating_point, self._usage, num_candidates),
             model=model,
             residuals=residuals if model is not None else np.full(len(pair), np.nan, np.float32),
             decided_by=self.name,
@@ -287,24 +300,26 @@ class Pruner:
         return estimates
 
     def _guard(self, pairs: Sequence[Correspondences]) -> None:
-        """Warn once if the matches are not the raw nearest neighbours that networks are trained on."""
+        """Warn once if the matches are not the raw nearest neighbours that the network is trained on."""
         if self._warned:
             return
+        reads_all = self._usage.input is MatchInput.ALL
         for pair in pairs:
             # Two copies of one photo match perfectly.
             if len(pair) < _GUARD_MIN_MATCHES or np.array_equal(pair.points0, pair.points1):
                 continue
             share = float(np.mean(pair.ratios > _GUARD_RATIO))
-            if share < _GUARD_MIN_SHARE or pair.mutual.all():
+            if share < _GUARD_MIN_SHARE or (reads_all and pair.mutual.all()):
                 self._warned = True
                 logger.warning(
                     "%s: these matches look filtered already (%.0f %% have a ratio over %.1f, %.0f %% are "
-                    "mutual); the network is trained on all nearest neighbours and may do harm here; "
+                    "mutual); the network is trained on %s nearest neighbours and may do harm here; "
                     "try --method loransac",
                     pair.name,
                     100 * share,
                     _GUARD_RATIO,
                     100 * float(np.mean(pair.mutual)),
+                    "all" if reads_all else "all mutual",
                 )
                 return
 

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from corrsfm.config import from_dict, option
+from corrsfm.config import MatchInput, from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
 from corrsfm.geometry import INLIER_THRESHOLD
@@ -36,6 +36,9 @@ class PrepareConfig:
     min_covisible: int = option(10, "Fewest shared points of a pair", minimum=1)
     max_pairs_per_scene: int = option(
         0, "Most pairs of a scene, spread evenly over its range of shared points; 0 for all", minimum=0
+    )
+    negatives: int = option(
+        0, "Most pairs of a scene that share nothing, added to learn from as all wrong", minimum=0
     )
     seed: int = option(0, "Seed of the choice of pairs", minimum=0)
 
@@ -90,6 +93,12 @@ class TrainConfig:
     val_file: Path | None = option(None, "Compact file of the validation scenes")
     output: Path = option(Path("training"), "Folder of the run: log, checkpoints")
     initial: str = option("", "Checkpoint, or name of a bundled one, whose weights the run starts from")
+    input: MatchInput = option(
+        MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
+    )
+    negative_share: float = option(
+        0.0, "Share of real pairs that show two places, all wrong", minimum=0, maximum=0.9
+    )
     synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0)
     batch_size: int = option(32, "Pairs in a batch, on each device", minimum=1)
     num_matches: int = option(2000, "Matches drawn from each pair", minimum=32)

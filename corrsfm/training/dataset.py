@@ -10,12 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from corrsfm.colmap.cameras import pinhole_parameters
+from corrsfm.config import MatchInput
 from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
@@ -47,6 +49,8 @@ class Batch:
         Side information before it becomes channels.
     mask : (B, N) bool
         False for padding.
+    related : (B,) bool
+        False for photos of two places, whose matches are all wrong.
     """
 
     correspondences: Tensor
@@ -57,10 +61,12 @@ class Batch:
     log_scale_ratios: Tensor
     rotations: Tensor
     mask: Tensor
+    related: Tensor
 
     def distances(self) -> Tensor:
-        """Squared symmetric epipolar distances (B, N) to the truth."""
-        return symmetric_epipolar_squared(self.true_correspondences, self.matrix)
+        """Squared symmetric epipolar distances (B, N) to the truth; infinite where two places are shown."""
+        distances = symmetric_epipolar_squared(self.true_correspondences, self.matrix)
+        return distances.masked_fill(~self.related[:, None], torch.inf)
 
     def inliers(self) -> Tensor:
         """Matches (B, N) that agree with the truth; False for padding."""
@@ -103,6 +109,10 @@ class RealPairs:
     scene_power : float
         A scene is drawn in proportion to its number of pairs to this power: 0 treats scenes alike, 1 treats
         pairs alike.
+    match_input : MatchInput
+        Matches to yield: all, or the mutual ones.
+    negative_share : float
+        Share of drawn pairs that show two places.
 
     Attributes
     ----------
@@ -111,7 +121,12 @@ class RealPairs:
     """
 
     def __init__(
-        self, scenes: Sequence[CompactScene | OANetPair], device: torch.device, scene_power: float = 0.5
+        self,
+        scenes: Sequence[CompactScene | OANetPair],
+        device: torch.device,
+        scene_power: float = 0.5,
+        match_input: MatchInput = MatchInput.ALL,
+        negative_share: float = 0.0,
     ) -> None:
         self.device = device
         names = [scene.name if isinstance(scene, CompactScene) else scene.scene for scene in scenes]
@@ -121,14 +136,14 @@ class RealPairs:
         num_keys = num_matches = 0
         for name, scene in zip(names, scenes, strict=True):
             if isinstance(scene, CompactScene):
-                arrays = _flatten_scene(scene, num_keys, num_matches)
+                arrays = _flatten_scene(scene, num_keys, num_matches, match_input)
             else:
-                arrays = _flatten_pair(scene, num_keys, num_matches)
+                arrays = _flatten_pair(scene, num_keys, num_matches, match_input)
             arrays["scene"] = np.full(len(arrays["matrix"]), number[name])
             for key, values in arrays.items():
                 parts.setdefault(key, []).append(values)
             num_keys += len(arrays["points"])
-            num_matches += len(arrays["key1"])
+            num_matches += len(arrays["key0"])
         if not parts:
             raise InputError("no scene to train on")
         self._arrays = {
@@ -137,14 +152,18 @@ class RealPairs:
         self.num_pairs = len(self._arrays["scene"])
         self.inlier_ratios, num_inliers = self._count_inliers()
         self._weights = self._pair_weights(num_inliers, scene_power)
+        if negative_share > 0:
+            negatives = self._negative_weights(scene_power)
+            self._weights = (1 - negative_share) * self._weights / self._weights.sum()
+            self._weights += negative_share * negatives / negatives.sum()
 
     @classmethod
-    def from_files(cls, paths: Sequence[Path], device: torch.device, scene_power: float = 0.5) -> RealPairs:
-        """Read compact files and files in OANet's layout; see the class."""
+    def from_files(cls, paths: Sequence[Path], device: torch.device, **options: Any) -> RealPairs:
+        """Read compact files and files in OANet's layout; the options are those of the class."""
         scenes: list[CompactScene | OANetPair] = []
         for path in paths:
             scenes.extend(read_scenes(path) if is_compact(path) else read_pairs(path))
-        return cls(scenes, device, scene_power)
+        return cls(scenes, device, **options)
 
     def _count_inliers(self) -> tuple[Tensor, Tensor]:
         ratios, counts = [], []
@@ -172,6 +191,18 @@ class RealPairs:
         share = 0.5 / (per_cell[cell] * levels[scene]).clamp(min=1) + 0.5 / per_scene[scene].clamp(min=1)
         return torch.where(usable, share * per_scene[scene] ** scene_power, 0.0)
 
+    def _negative_weights(self, scene_power: float) -> Tensor:
+        scene, negative = self._arrays["scene"], ~self._arrays["related"]
+        # Matches, too: a network cannot read a pair of none.
+        negative = negative & (self._arrays["num_matches"] >= _MIN_INLIERS)
+        if not negative.any():
+            raise InputError(
+                "no pair of photos that share nothing, but negative_share is above 0; "
+                "make some with: corrsfm train prepare --negatives"
+            )
+        per_scene = torch.bincount(scene[negative], minlength=len(self.scene_names)).double()
+        return torch.where(negative, per_scene[scene].clamp(min=1) ** (scene_power - 1), 0.0)
+
     def _gather(self, pairs: Tensor, columns: Tensor) -> Batch:
         """Matches ``columns`` (B, N) of ``pairs`` (B,); columns beyond a pair's matches are padding."""
         a = self._arrays
@@ -188,6 +219,7 @@ class RealPairs:
             log_scale_ratios=(a["log_scales"][key1] - a["log_scales"][key0]).float(),
             rotations=a["orientations"][key1] - a["orientations"][key0],
             mask=mask,
+            related=a["related"][pairs],
         )
 
     def sample(
@@ -214,13 +246,16 @@ class RealPairs:
         return augment(batch, guess, config, generator)
 
 
-def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str, np.ndarray]:
+def _flatten_pair(
+    pair: OANetPair, first_key: int, first_match: int, match_input: MatchInput
+) -> dict[str, np.ndarray]:
     """Arrays of a pair in OANet's layout; its keypoints are those of image 0, then of image 1."""
     num = len(pair)
     zeros = np.zeros(num, np.float32)
     # YFCC100M has more keypoints than 32 bits can count.
     dtype = np.int32 if first_key + 2 * num < 2**31 else np.int64
-    rows = first_key + np.arange(num)
+    read = np.flatnonzero(pair.mutual) if match_input is MatchInput.MUTUAL else np.arange(num)
+    rows = first_key + read
     return {
         "points": pair.correspondences.reshape(num, 2, 2).transpose(1, 0, 2).reshape(-1, 2),
         "corrections": np.zeros((2 * num, 2), np.float32),
@@ -228,20 +263,24 @@ def _flatten_pair(pair: OANetPair, first_key: int, first_match: int) -> dict[str
         "orientations": np.concatenate([zeros, pair.rotations]),
         "key0": rows.astype(dtype),
         "key1": (rows + num).astype(dtype),
-        "ratios": quantise_ratios(pair.ratios),
-        "mutual": pair.mutual,
-        "num_matches": np.array([num]),
+        "ratios": quantise_ratios(pair.ratios[read]),
+        "mutual": pair.mutual[read],
+        "num_matches": np.array([len(read)]),
+        "related": np.array([True]),
         "match_start": np.array([first_match]),
         "guess": np.ones((1, 2), np.float32),
         "matrix": essential_from_pose(pair.rotation, pair.translation)[None].astype(np.float32),
     }
 
 
-def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dict[str, np.ndarray]:
+def _flatten_scene(
+    scene: CompactScene, first_key: int, first_match: int, match_input: MatchInput
+) -> dict[str, np.ndarray]:
     """Arrays of a scene with indices into the concatenation of all scenes."""
     images = range(len(scene.image_names))
     points = [scene.normalised(image, undistorted=False) for image in images]
-    found = [scene.matched(index) for index in range(len(scene.pairs))]
+    only_mutual = match_input is MatchInput.MUTUAL
+    found = [scene.matched(index, only_mutual=only_mutual) for index in range(len(scene.pairs))]
     counts = np.array([len(index0) for index0, _ in found], np.int64)
     matched = [scene.match_offsets[index] + index0 for index, (index0, _) in enumerate(found)]
     rows = np.concatenate(matched) if matched else np.zeros(0, np.int64)
@@ -274,6 +313,7 @@ def _flatten_scene(scene: CompactScene, first_key: int, first_match: int) -> dic
         "ratios": quantise_ratios(scene.ratios[rows]),
         "mutual": scene.mutual[rows],
         "num_matches": counts,
+        "related": scene.covisible > 0,
         "match_start": first_match + np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int64),
         "guess": np.array(guesses, np.float32),
         "matrix": np.array(matrices, np.float32),
@@ -346,6 +386,7 @@ def augment(batch: Batch, guess: Tensor, config: AugmentConfig, generator: torch
         log_scale_ratios=batch.log_scale_ratios * sign,
         rotations=rotations * sign,
         mask=batch.mask,
+        related=batch.related,
     )
 
 

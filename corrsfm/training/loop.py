@@ -15,13 +15,14 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import from_dict, to_dict
+from corrsfm.config import MatchInput, from_dict, to_dict
 from corrsfm.errors import ConfigError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
 from corrsfm.prune.correspondences import SIDE_LAYOUTS
@@ -66,10 +67,22 @@ def train(
     Raises
     ------
     ConfigError
-        If the output folder holds a run already and ``resume`` is not set.
+        If synthetic pairs are wanted for a network that reads mutual matches only; if the output folder holds
+        a run already and ``resume`` is not set.
     """
+    if recipe.train.input is MatchInput.MUTUAL and recipe.train.synthetic_share > 0:
+        raise ConfigError(
+            "synthetic pairs hold all nearest neighbours; set synthetic_share to 0 for input mutual"
+        )
     with _process_group(torch.device(device)) as (rank, own_device):
-        data = RealPairs.from_files(recipe.train.train_files, own_device, recipe.train.scene_power)
+        options = recipe.train
+        data = RealPairs.from_files(
+            options.train_files,
+            own_device,
+            scene_power=options.scene_power,
+            match_input=options.input,
+            negative_share=options.negative_share,
+        )
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
         if trainer.state_path.exists():
             if not resume:
@@ -99,6 +112,8 @@ def network_config(recipe: TrainRecipe) -> NetworkConfig:
 def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     """Build the network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
 
+    It reads what the recipe says; an initial checkpoint may have read another kind of matches.
+
     Raises
     ------
     CheckpointError
@@ -109,7 +124,9 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     """
     config = network_config(recipe)
     if not recipe.train.initial:
-        return CorrAdaptor.from_config(config)
+        network = CorrAdaptor.from_config(config)
+        network.usage = replace(network.usage, input=recipe.train.input)
+        return network
     network = load_network(recipe.train.initial, architecture="corradaptor")
     assert network.config is not None
     if recipe.network and network.config != config:
@@ -117,6 +134,7 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
             f"network: differs from that of the initial checkpoint {recipe.train.initial}, which is "
             f"{to_dict(network.config)}; leave the table out to continue with that network"
         )
+    network.usage = replace(network.usage, input=recipe.train.input)
     return network
 
 
@@ -271,8 +289,12 @@ class Trainer:
         logits = [logits.float() for logits in output.logits]
         total = classification_loss(logits, steps, masks, self.config.threshold)
         parts = {"classification": float(total.detach())}
-        if with_essential:
-            essential = essential_loss(output.essential.float(), virtual_points(batch.matrix))
+        related = batch.related
+        if with_essential and bool(related.any()):
+            # Photos of two places have no matrix to find.
+            essential = essential_loss(
+                output.essential.float()[related], virtual_points(batch.matrix[related])
+            )
             total = total + self.config.essential_weight * essential
             parts["essential"] = float(essential.detach())
         return total, parts
@@ -289,6 +311,7 @@ class Trainer:
             optimiser=self.optimiser.state_dict(),
             random=torch.get_rng_state(),
             network_config=json.dumps(to_dict(self.network.config)),
+            input=str(self.config.input),
         )
         save_network(self._averaged(), self.config.output / "latest.pt", provenance=self._provenance())
 
@@ -298,6 +321,11 @@ class Trainer:
         if state["network_config"] != json.dumps(to_dict(self.network.config)):
             raise ConfigError(
                 f"{self.state_path}: belongs to another network; use another --output or the same recipe"
+            )
+        if (began := state.get("input", MatchInput.ALL)) != self.config.input:
+            raise ConfigError(
+                f"{self.state_path}: the run began with input {began}, not {self.config.input}; "
+                "use another --output or the same recipe"
             )
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
@@ -325,6 +353,7 @@ class Trainer:
     def _averaged(self) -> CorrAdaptor:
         assert self.network.config is not None
         network = CorrAdaptor.from_config(self.network.config).to(self.device)
+        network.usage = self.network.usage
         if self.config.ema_decay > 0:
             self.average.copy_to(network)
         else:

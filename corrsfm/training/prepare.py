@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_by_pinhole, normalise_points
 from corrsfm.colmap.models import find_model, poses_of, read_model
-from corrsfm.errors import ImageError, InputError, WorkspaceError
+from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError
 from corrsfm.features.sift import extract_features
 from corrsfm.images.photos import read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
@@ -131,7 +131,15 @@ def prepare_file(output: Path, scenes: Iterable[Path], config: PrepareConfig) ->
 
 
 def prepare_oanet(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> list[tuple[str, int]]:
-    """Prepare scenes into one file in OANet's layout; returns each scene's name and number of pairs."""
+    """Prepare scenes into one file in OANet's layout; returns each scene's name and number of pairs.
+
+    Raises
+    ------
+    ConfigError
+        If negatives are wanted: the layout cannot mark them.
+    """
+    if config.negatives:
+        raise ConfigError("negatives: OANet's layout cannot mark them; use --layout compact")
     done: list[tuple[str, int]] = []
     prepared = _prepared(scenes, config, done)
     write_pairs(output, (scene.pair(index) for scene in prepared for index in range(len(scene.pairs))))
@@ -163,16 +171,17 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         _features(images / name, camera, config)
         for name, camera in zip(model.names, model.cameras, strict=True)
     ]
-    usable = {
-        pair: count
-        for pair, count in model.covisible.items()
-        if count >= config.min_covisible and min(len(features[index]) for index in pair) >= _MIN_KEYPOINTS
-    }
+    matchable = [index for index, each in enumerate(features) if len(each) >= _MIN_KEYPOINTS]
+    counts = {pair: model.covisible.get(pair, 0) for pair in combinations(matchable, 2)}
+    usable = {pair: count for pair, count in counts.items() if count >= config.min_covisible}
     if not usable:
         raise InputError(
             f"{folder}: no pair of photos shares {config.min_covisible} points; give more photos"
         )
     pairs = choose_pairs(usable, config.max_pairs_per_scene, config.seed)
+    if config.negatives:
+        unrelated = {pair: 0 for pair, count in counts.items() if count == 0}
+        pairs = sorted(pairs + choose_pairs(unrelated, config.negatives, config.seed))
     neighbours, ratios, mutual = [], [], []
     for index0, index1 in pairs:
         matches = match_features(features[index0].descriptors, features[index1].descriptors)
@@ -198,7 +207,7 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         log_scales=np.log(np.concatenate([each.scales for each in features])),
         orientations=np.concatenate([each.orientations for each in features]),
         pairs=np.array(pairs, np.int64),
-        covisible=np.array([usable[pair] for pair in pairs], np.int64),
+        covisible=np.array([counts[pair] for pair in pairs], np.int64),
         match_offsets=_offsets(neighbours),
         neighbours=np.concatenate(neighbours),
         ratios=np.concatenate(ratios),

@@ -136,6 +136,7 @@ def make_pairs(
         log_scale_ratios=side[2],
         rotations=side[3],
         mask=torch.ones(num_pairs, num_matches, dtype=torch.bool, device=device),
+        related=torch.ones(num_pairs, dtype=torch.bool, device=device),
     )
 
 

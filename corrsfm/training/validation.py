@@ -17,7 +17,7 @@ from corrsfm.labelled.compact import read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.model import CorrAdaptor
 from corrsfm.prune.correspondences import side_information
-from corrsfm.prune.selection import POSE_MIN_SCORE
+from corrsfm.prune.selection import select_candidates
 from corrsfm.types import PruneResult
 
 __all__ = ["Validation", "match_scores", "pose_error_deg"]
@@ -30,14 +30,20 @@ _SEED = 0
 
 
 def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) -> NDArray[np.float32]:
-    """Probability (M,) that each match is an inlier, by its last logit."""
-    side = side_information(pair.as_correspondences(), network.side_channels)
+    """Probability (M,) that each match is an inlier, by its last logit; 0 for those not read."""
+    seen = pair.as_correspondences()
+    rows = select_candidates(seen, len(pair), network.usage.input)
+    scores = np.zeros(len(pair), np.float32)
+    if not len(rows):
+        return scores
+    side = side_information(seen, network.side_channels)[rows]
     with torch.inference_mode():
         output = network(
-            torch.from_numpy(pair.correspondences)[None].to(device),
+            torch.from_numpy(pair.correspondences[rows])[None].to(device),
             torch.from_numpy(side)[None].to(device) if network.side_channels else None,
         )
-    return output.last_logits()[0].sigmoid().cpu().numpy()
+    scores[rows] = output.last_logits()[0].sigmoid().cpu().numpy()
+    return scores
 
 
 def pose_error_deg(pair: OANetPair, kept: NDArray[np.bool_]) -> float:
@@ -74,11 +80,10 @@ class Validation:
         kept = [result.inlier_mask for result in parse_filter(BASELINE)(self.pairs)]
         self.baseline = self._summary(list(map(pose_error_deg, self.pairs, kept)))
 
-    def run(
-        self, network: CorrAdaptor, device: torch.device, threshold: float = POSE_MIN_SCORE
-    ) -> dict[str, Any]:
-        """Score a network: pose AUC over all pairs and by scene, precision, recall."""
+    def run(self, network: CorrAdaptor, device: torch.device) -> dict[str, Any]:
+        """Score a network at its ``pose_min_score``: pose AUC overall and by scene, precision, recall."""
         network.eval()
+        threshold = network.usage.pose_min_score
         scores = [match_scores(network, pair, device) for pair in self.pairs]
         return self.judge(scores, lambda score: score > threshold)
 

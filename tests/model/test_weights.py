@@ -7,6 +7,7 @@ import pytest
 import torch
 from published_weights import published_state
 
+from corrsfm.config import MatchInput, NetworkUsage
 from corrsfm.errors import CheckpointError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, read_provenance, save_network, weights
 
@@ -60,7 +61,22 @@ def test_half_precision_halves_the_file_and_loads_as_float32(network, checkpoint
 def test_stored_weights_load_without_running_code(checkpoint):
     content = torch.load(checkpoint, weights_only=True)
     assert content["format"] == weights.FORMAT
-    assert set(content) == {"format", "config", "state_dict", "provenance"}
+    assert set(content) == {"format", "config", "state_dict", "usage", "provenance"}
+
+
+def test_usage_travels_with_the_weights(network, tmp_path):
+    path = tmp_path / "mutual.pt"
+    network.usage = NetworkUsage(input=MatchInput.MUTUAL, sfm_min_score=0.2)
+    save_network(network, path)
+    assert load_network(path).usage == network.usage
+
+
+def test_a_checkpoint_without_usage_reads_all_matches(checkpoint):
+    content = torch.load(checkpoint, weights_only=True)
+    del content["usage"]
+    torch.save(content, checkpoint)
+    assert load_network(checkpoint).usage == NetworkUsage()
+    assert NetworkUsage().input is MatchInput.ALL
 
 
 @pytest.mark.parametrize("prefix", ["", "module."])
@@ -70,6 +86,7 @@ def test_published_format_loads(shared_dir, tmp_path, prefix):
     torch.save({"epoch": 3, "state_dict": {prefix + name: value for name, value in state.items()}}, path)
     loaded = load_network(path)
     assert loaded.config == NetworkConfig()
+    assert loaded.usage == NetworkUsage()
     weight = state["ds_0.aggregator1.conv1.0.weight"]  # (128,128,1,3)
     assert torch.equal(loaded.blocks[0].rounds[0].explicit.ring.weight[:, 128:256], weight[:, :, 0, 1])
     assert torch.equal(loaded.blocks[1].rounds[1].logit.bias, state["ds_1.linear_1.bias"])
@@ -101,6 +118,12 @@ def test_published_format_with_other_keys_is_refused(tmp_path):
         (lambda content: content["config"].update(channels=32), "has shape"),
         (lambda content: content["config"].update(channels=30), "channels is 30"),
         (lambda content: content["config"].update(colour=1), "unknown network options colour"),
+        (
+            lambda content: content["usage"].update(input="some"),
+            "input is 'some', expected one of all, mutual",
+        ),
+        (lambda content: content["usage"].update(pose_min_score=2.0), "pose_min_score is 2.0"),
+        (lambda content: content.update(usage="mutual"), "its usage is a str"),
         (lambda content: content.pop("state_dict"), "no 'state_dict'"),
         (lambda content: content["state_dict"]["head.output.bias"].fill_(torch.nan), "not finite"),
     ],

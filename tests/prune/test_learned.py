@@ -8,8 +8,8 @@ import torch
 from float64_judge import in_float64
 from two_view_pairs import make_pair
 
-from corrsfm.config import OperatingPoint, Precision, PruneConfig, PruneMethod
-from corrsfm.errors import CheckpointError, CorrsfmError
+from corrsfm.config import MatchInput, NetworkUsage, OperatingPoint, Precision, PruneConfig, PruneMethod
+from corrsfm.errors import CheckpointError, CorrsfmError, InputError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.model.rivals import RivalConfig, build_rival
 from corrsfm.prune import Pruner, build_pruner
@@ -31,6 +31,20 @@ def network():
             if name.endswith("layer_scale"):
                 value.fill_(0.5)
     return network.eval()
+
+
+@pytest.fixture(scope="module")
+def mutual_network(network):
+    reader = CorrAdaptor.from_config(SMALL)
+    reader.load_state_dict(network.state_dict())
+    reader.usage = NetworkUsage(input=MatchInput.MUTUAL)
+    return reader.eval()
+
+
+def rows_of(pair, rows):
+    """Some matches of a pair."""
+    names = ("points0", "points1", "normalised", "ratios", "mutual", "log_scale_ratios", "rotations")
+    return dataclasses.replace(pair, **{name: getattr(pair, name)[rows] for name in names})
 
 
 def make(seed=0, num=120, inlier_ratio=0.5):
@@ -142,20 +156,46 @@ def test_matches_beyond_the_candidates_are_judged_by_the_same_matrix(network):
     assert len(result) == 300
     assert np.isfinite(result.residuals).all()
     rows = select_candidates(pair, 100)
-    few = dataclasses.replace(
-        pair,
-        **{
-            name: getattr(pair, name)[rows]
-            for name in ("points0", "points1", "normalised", "ratios", "mutual")
-        },
-        log_scale_ratios=pair.log_scale_ratios[rows],
-        rotations=pair.rotations[rows],
-    )
-    (alone,) = pruner_of(network)([few])
+    (alone,) = pruner_of(network)([rows_of(pair, rows)])
     # The network sees the same numbers in the same shape, so it says the same, bit by bit.
     np.testing.assert_array_equal(alone.scores, result.scores[rows])
     np.testing.assert_array_equal(alone.model.matrix, result.model.matrix)
     np.testing.assert_allclose(alone.residuals, result.residuals[rows], rtol=1e-5, atol=1e-12)
+
+
+@pytest.mark.parametrize("point", list(OperatingPoint))
+def test_a_network_of_mutual_matches_is_fed_nothing_else(network, mutual_network, point):
+    pair = make(num=300)
+    mutual = np.flatnonzero(pair.mutual)
+    assert 32 < len(mutual) < 300
+    (result,) = pruner_of(mutual_network, operating_point=point)([pair])
+    # The other network sees the same numbers in the same shape, so it says the same, bit by bit.
+    (alone,) = pruner_of(network, operating_point=point)([rows_of(pair, mutual)])
+    np.testing.assert_array_equal(result.scores[mutual], alone.scores)
+    np.testing.assert_array_equal(result.model.matrix, alone.model.matrix)
+    np.testing.assert_array_equal(result.inlier_mask[mutual], alone.inlier_mask)
+    assert not result.scores[~pair.mutual].any() and not result.inlier_mask[~pair.mutual].any()
+    # Candidates are counted among the mutual ones; those left over are judged by the matrix.
+    (bounded,) = pruner_of(mutual_network, max_candidates=len(mutual) - 1)([pair])
+    assert not bounded.scores[~pair.mutual].any()
+
+
+def test_a_pair_without_mutual_matches_keeps_nothing(mutual_network):
+    pair = dataclasses.replace(make(num=60), mutual=np.zeros(60, bool))
+    for result in pruner_of(mutual_network)([make(num=60), pair, make(num=0)])[1:]:
+        assert result.model is None and not result.scores.any() and not result.inlier_mask.any()
+
+
+def test_points_without_mutual_flags_are_refused_by_a_network_that_reads_those_only(network, mutual_network):
+    pair = dataclasses.replace(make(), mutual_known=False)
+    pruner_of(network)([pair])
+    with pytest.raises(InputError, match="mutual="):
+        pruner_of(mutual_network)([pair])
+
+
+def test_usage_is_part_of_the_fingerprint(network, mutual_network):
+    fingerprints = {pruner_of(each).fingerprint for each in (network, mutual_network)}
+    assert len(fingerprints) == 2 and any("input=mutual" in each for each in fingerprints)
 
 
 @pytest.mark.parametrize("num", [0, 1, 8, 10, 40])
@@ -181,6 +221,15 @@ def test_degenerate_matches_give_finite_scores(network, num, case):
     assert ((result.scores >= 0) & (result.scores <= 1)).all()
     assert result.model is None or np.isfinite(result.model.matrix).all()
     assert not np.isnan(result.residuals).any() or result.model is None
+
+
+def test_mutual_matches_alone_are_what_a_network_of_mutual_matches_expects(network, mutual_network, caplog):
+    pair = dataclasses.replace(make(num=100, inlier_ratio=0.3), mutual=np.ones(100, bool))
+    with caplog.at_level(logging.WARNING):
+        pruner_of(mutual_network)([pair])
+        assert caplog.text == ""
+        pruner_of(network)([pair])
+    assert "trained on all nearest neighbours" in caplog.text
 
 
 def test_filtered_matches_are_warned_about_once(network, caplog):

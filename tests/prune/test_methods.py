@@ -13,8 +13,9 @@ from corrsfm.types import Correspondences, Features, Matches, PruneResult
 METHODS = ["none", "ratio", "loransac", "magsac", "corradaptor", "cascade"]
 
 
-def make(seed=0, num=300, inlier_ratio=0.5, calibrated=True) -> Correspondences:
-    pair = make_pair(seed=seed, num=num, inlier_ratio=inlier_ratio, noise_px=0.5).as_correspondences()
+def make(seed=0, num=300, inlier_ratio=0.5, calibrated=True, relief=False) -> Correspondences:
+    labelled = make_pair(seed=seed, num=num, inlier_ratio=inlier_ratio, noise_px=0.5, relief=relief)
+    pair = labelled.as_correspondences()
     camera = dataclasses.replace(CAMERA, has_prior_focal_length=calibrated)
     return dataclasses.replace(pair, camera0=camera, camera1=camera)
 
@@ -122,8 +123,7 @@ def test_result_of_a_pair_does_not_depend_on_the_others(pruner):
 
 
 def test_pruner_keeps_order_of_matches(pruner):
-    pair = make(num=200, inlier_ratio=0.6)
-    right = right_matches(num=200, inlier_ratio=0.6)
+    pair, right = make(num=400, relief=True), right_matches(num=400)
     (result,) = pruner([pair])
     assert result.inlier_mask[right].mean() > 0.8
     assert result.scores[right].mean() > result.scores[~right].mean() + 0.2

@@ -16,11 +16,18 @@ CAMERA = Camera(
 
 
 def make_pair(
-    *, seed: int, num: int, inlier_ratio: float = 0.5, noise_px: float = 0.0, scene: str = ""
+    *,
+    seed: int,
+    num: int,
+    inlier_ratio: float = 0.5,
+    noise_px: float = 0.0,
+    relief: bool = False,
+    scene: str = "",
 ) -> OANetPair:
     """A pair with ``round(num · inlier_ratio)`` right matches in random places among wrong ones.
 
-    Right matches have small ratios and are mutual; wrong ones mostly neither.
+    Right matches have small ratios and are mutual; wrong ones mostly neither. The points are a cloud without
+    structure, or lie on a relief: a network that learned from photos expects a surface.
     """
     generator = np.random.default_rng(seed)
     angle = np.radians(generator.uniform(5, 20))
@@ -29,6 +36,8 @@ def make_pair(
     points = np.column_stack(
         [generator.uniform(-2, 2, num), generator.uniform(-1.5, 1.5, num), generator.uniform(4, 9, num)]
     )
+    if relief:
+        points[:, 2] = 6 + np.sin(points[:, 0]) + 0.5 * np.cos(2 * points[:, 1])
     moved = points @ rotation.T + translation
     matches = np.hstack([points[:, :2] / points[:, 2:], moved[:, :2] / moved[:, 2:]])
     matches += generator.normal(0, 1, (num, 4)) * noise_px / 500.0

@@ -7,6 +7,8 @@ import pytest
 import torch
 from labelled_scene import make_scene
 
+from corrsfm.config import MatchInput
+from corrsfm.errors import InputError
 from corrsfm.prune import correspondences
 from corrsfm.training.config import NO_AUGMENTATION, AugmentConfig
 from corrsfm.training.dataset import RealPairs, augment, generator_for, side_information
@@ -100,6 +102,46 @@ def test_side_channels_are_those_of_inference():
     assert channels is not None
     np.testing.assert_allclose(channels[0].numpy(), expected, atol=3e-3)
     assert side_information(batch, 0) is None
+
+
+def test_mutual_input_yields_the_mutual_matches_of_either_layout():
+    scene = make_scene("a", num_keypoints=160)
+    pairs = [scene.pair(index) for index in range(6)]
+    for source in ([scene], pairs):
+        data = RealPairs(source, CPU, match_input=MatchInput.MUTUAL)
+        for index, pair in enumerate(pairs):
+            num = int(pair.mutual.sum())
+            batch = data._gather(torch.tensor([index]), torch.arange(num + 1)[None])
+            assert batch.mask[0].tolist() == [True] * num + [False]
+            assert batch.mutual[batch.mask].all()
+            seen, read = pair.correspondences[pair.mutual], batch.correspondences[0, :num].numpy()
+            np.testing.assert_allclose(read, seen, atol=1e-6)
+            np.testing.assert_allclose(batch.ratios[0, :num], pair.ratios[pair.mutual], atol=3e-3)
+            rotations = batch.rotations[0, :num].numpy() - pair.rotations[pair.mutual]
+            np.testing.assert_allclose(np.cos(rotations), 1, atol=1e-5)
+
+
+def with_negatives(scene, num):
+    """The scene with its first pairs marked as showing two places."""
+    covisible = scene.covisible.copy()
+    covisible[:num] = 0
+    return dataclasses.replace(scene, covisible=covisible)
+
+
+def test_negatives_are_all_wrong_and_drawn_as_often_as_asked():
+    scenes = [with_negatives(make_scene("a"), 2), with_negatives(make_scene("b", seed=1), 1)]
+    data = RealPairs(scenes, CPU, negative_share=0.25)
+    batch = data.sample(400, 32, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    assert 0.18 < float((~batch.related).float().mean()) < 0.32
+    assert not batch.inliers()[~batch.related].any()
+    assert batch.inliers()[batch.related].any(1).all()
+    never = RealPairs(scenes, CPU).sample(400, 32, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    assert never.related.all()
+
+
+def test_a_share_of_negatives_without_any_is_refused():
+    with pytest.raises(InputError, match="train prepare --negatives"):
+        RealPairs([make_scene("a")], CPU, negative_share=0.1)
 
 
 def test_batches_depend_on_seed_step_and_rank_only(data):

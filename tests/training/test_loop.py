@@ -9,6 +9,7 @@ import pytest
 import torch
 from labelled_scene import make_scene
 
+from corrsfm.config import MatchInput
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.labelled.compact import write_scenes
 from corrsfm.model import load_network, read_provenance, save_network
@@ -45,6 +46,40 @@ def test_overfits_one_batch(data, tmp_path):
     # Each step doubles what rounding began, so a single late loss is a draw: processors differ by a factor of
     # two in it. The best of ten is below a quarter in all orders of summation that were tried.
     assert min(losses[-10:]) < 0.45 * losses[0]
+
+
+def test_overfits_one_batch_of_mutual_matches(tmp_path):
+    scenes = [make_scene("a", num_keypoints=160), make_scene("b", num_keypoints=160, seed=1)]
+    data = RealPairs(scenes, CPU, match_input=MatchInput.MUTUAL)
+    recipe = make_recipe(tmp_path, learning_rate=1e-2, ema_decay=0.0, input=MatchInput.MUTUAL)
+    trainer = Trainer(recipe, data, CPU)
+    batch = data.sample(4, 48, AugmentConfig(), generator_for(0, 0, 0, CPU))
+    assert batch.mutual[batch.mask].all()
+    trainer.draw = lambda step: batch  # type: ignore[method-assign]
+    losses = [trainer.train_step(0.25)["loss"] for _ in range(100)]
+    assert min(losses[-10:]) < 0.45 * losses[0]
+    trainer.save()
+    assert load_network(tmp_path / "latest.pt").usage.input is MatchInput.MUTUAL
+    with pytest.raises(ConfigError, match="began with input mutual, not all"):
+        Trainer(make_recipe(tmp_path), data, CPU).load()
+
+
+def test_a_batch_of_photos_of_two_places_only_has_a_finite_loss(data, tmp_path):
+    trainer = Trainer(make_recipe(tmp_path, essential_start=0.0), data, CPU)
+    batch = trainer.draw(0)
+    for related in ([False] * 4, [True, False, False, True]):
+        mixed = dataclasses.replace(batch, related=torch.tensor(related))
+        trainer.draw = lambda step, mixed=mixed: mixed  # type: ignore[method-assign]
+        losses = trainer.train_step(0.9)
+        assert math.isfinite(losses["loss"]) and math.isfinite(losses["gradient"])
+        assert ("essential" in losses) == any(related)
+    assert trainer.num_skipped == 0
+
+
+def test_synthetic_pairs_are_not_for_a_network_of_mutual_matches(tmp_path):
+    recipe = make_recipe(tmp_path, input=MatchInput.MUTUAL, synthetic_share=0.5)
+    with pytest.raises(ConfigError, match="synthetic_share to 0"):
+        train(recipe, device=CPU)
 
 
 def test_stop_and_resume_equals_a_straight_run_bitwise(data, tmp_path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 import torch
 
+from corrsfm.config import MatchInput
 from corrsfm.errors import ConfigError, InputError
-from corrsfm.labelled.compact import read_scenes
+from corrsfm.labelled.compact import read_labelled_pairs, read_scenes
 from corrsfm.labelled.oanet import read_pairs
 from corrsfm.model import CorrAdaptor, NetworkConfig
 from corrsfm.training.config import NO_AUGMENTATION, PrepareConfig, load_recipe
@@ -134,6 +135,29 @@ def test_rendered_views_are_training_data(repository):
         assert pair.inliers()[~pair.mutual].mean() < 0.3
 
 
+def test_photos_that_share_nothing_are_negatives(repository, tmp_path):
+    scene = repository / "sample_scenes" / "colonnade"
+    shared = tmp_path / "colonnade"
+    shared.mkdir()
+    for path in scene.iterdir():
+        (shared / path.name).symlink_to(path)
+    names = sorted(path.name for path in (scene / "images").iterdir())
+    (shared / "covisibility.txt").write_text(f"{names[0]} {names[1]} 50\n{names[1]} {names[2]} 5\n")
+    config = PrepareConfig(max_features=200, negatives=3)
+    assert prepare_file(tmp_path / "pairs.h5", [shared], config) == [("colonnade", 4)]
+    (prepared,) = read_scenes(tmp_path / "pairs.h5")
+    covisible = {tuple(pair): count for pair, count in zip(prepared.pairs, prepared.covisible, strict=True)}
+    # A pair that shares fewer points than asked for is neither related nor a negative.
+    assert covisible.pop((0, 1)) == 50 and (1, 2) not in covisible
+    assert list(covisible.values()) == [0, 0, 0]
+    negative = prepared.pair(int(np.flatnonzero(prepared.covisible == 0)[0]))
+    assert np.isinf(negative.label_distances).all() and not negative.inliers().any()
+    # Evaluation and validation have no use for them.
+    assert len(list(read_labelled_pairs(tmp_path / "pairs.h5"))) == 1
+    with pytest.raises(ConfigError, match="--layout compact"):
+        prepare_oanet(tmp_path / "oanet.h5", [shared], config)
+
+
 def test_a_folder_without_a_model_is_refused(tmp_path):
     with pytest.raises(InputError, match="holds no COLMAP model"):
         prepare_scene(tmp_path, CONFIG)
@@ -158,6 +182,12 @@ def test_the_second_part_of_the_small_recipe_continues_the_first(repository):
     assert Path(second.train.initial) == first.train.output / "latest.pt"
     assert second.network == {}
     assert second.train.train_files == first.train.train_files
+
+
+def test_the_mutual_recipe_reads_mutual_matches_and_continues_a_network(repository):
+    recipe = load_recipe(repository / "pipelines" / "train_mutual.toml")
+    assert recipe.train.input is MatchInput.MUTUAL
+    assert recipe.train.initial and recipe.network == {}
 
 
 def test_a_recipe_with_an_unknown_key_is_refused(tmp_path):

@@ -5,6 +5,7 @@ import pytest
 import torch
 from labelled_scene import make_scene
 
+from corrsfm.config import MatchInput, NetworkUsage
 from corrsfm.evaluation.two_view.methods import parse_method
 from corrsfm.evaluation.two_view.pose import score_pairs
 from corrsfm.labelled.compact import write_scenes
@@ -42,5 +43,8 @@ def test_every_match_gets_a_probability(validation: Validation) -> None:
     scores = match_scores(network, validation.pairs[0], torch.device("cpu"))
     assert scores.shape == (len(validation.pairs[0]),)
     assert ((scores > 0) & (scores < 1)).all()
+    network.usage = NetworkUsage(input=MatchInput.MUTUAL)
+    scores = match_scores(network, validation.pairs[0], torch.device("cpu"))
+    np.testing.assert_array_equal(scores > 0, validation.pairs[0].mutual)
     result = validation.run(network, torch.device("cpu"))
     assert len(result["errors"]) == 6 and set(result["by_scene"]) == {"a", "b"}
