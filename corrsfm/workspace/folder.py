@@ -17,6 +17,7 @@
     ├── evidence.json       why the first model was chosen, and the verdict on it
     ├── sparse.old/         models of earlier matches, moved here when mapping failed
     ├── report.json, report.html
+    ├── .seeds/SEED/        workspaces of further seeds, for `corrsfm compare` and `corrsfm evaluate scene`
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
 
@@ -117,6 +118,7 @@ class Workspace:
         self.sparse = root / "sparse"
         self.evidence = root / "evidence.json"
         self.candidates = root / ".candidates"
+        self.seeds = root / ".seeds"
         self.report_json = root / "report.json"
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"
