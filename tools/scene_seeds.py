@@ -39,7 +39,7 @@ def reconstruct(workspace: Path, scene: Path, seed: int, flags: list[str]) -> di
     started = time.monotonic()
     corrsfm("reconstruct", workspace, "--seed", seed, *flags)
     seconds = time.monotonic() - started
-    measured = corrsfm("evaluate", "scene", workspace, "--ground-truth", scene, "--json")
+    measured = corrsfm("evaluate", "scene", workspace, "--ground-truth", scene, "--seeds", 1, "--json")
     score = json.loads(measured.stdout) if measured.returncode == 0 else {}
     evidence = workspace / "evidence.json"
     values = json.loads(evidence.read_text(encoding="utf-8")) if evidence.exists() else {}

@@ -9,7 +9,13 @@ import click
 from click.core import ParameterSource
 
 from corrsfm.cli.evaluate import command_line
-from corrsfm.cli.options import echo_json, json_option, overwrite_option, pipeline_options
+from corrsfm.cli.options import (
+    echo_json,
+    json_option,
+    overwrite_option,
+    pipeline_options,
+    seeds_option,
+)
 from corrsfm.cli.sections import SectionedCommand
 from corrsfm.config import PipelineConfig
 
@@ -18,7 +24,10 @@ __all__ = ["compare"]
 PATH = click.Path(path_type=Path)
 
 
-@click.command(cls=SectionedCommand, most_used=("methods", "output", "ground_truth", "max_features", "file"))
+@click.command(
+    cls=SectionedCommand,
+    most_used=("methods", "num_seeds", "output", "ground_truth", "max_features", "file"),
+)
 @click.argument("images_dir", metavar="IMAGES", type=PATH)
 @click.option(
     "--methods",
@@ -33,6 +42,7 @@ PATH = click.Path(path_type=Path)
 )
 @click.option("--ground-truth", type=PATH, help="COLMAP model or folder of camera files to measure against.")
 @click.option("--results", type=PATH, help="Also write the result file here.")
+@seeds_option
 @functools.partial(pipeline_options, several_methods=True)
 @overwrite_option
 @json_option
@@ -42,14 +52,15 @@ def compare(
     output: Path | None,
     ground_truth: Path | None,
     results: Path | None,
+    num_seeds: int,
     config: PipelineConfig,
     overwrite: bool,
     as_json: bool,
 ) -> None:
     """Compare prune methods on the same photos.
 
-    Features and matches are computed once. The table goes to standard output, the page with the pairs that
-    differ most to OUTPUT/compare.html.
+    Features and matches are computed once, models once for every method and seed. The table, median (worst)
+    over the seeds, goes to standard output, the page with the pairs that differ most to OUTPUT/compare.html.
     """
     source = click.get_current_context().get_parameter_source("method")
     if source is ParameterSource.COMMANDLINE:
@@ -63,6 +74,7 @@ def compare(
         output,
         [method.strip() for method in methods.split(",")],
         config,
+        num_seeds=num_seeds,
         ground_truth=ground_truth,
         results=results,
         overwrite=overwrite,

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 
-from corrsfm.cli.options import echo_json, json_option, overwrite_option, run_options
+from corrsfm.cli.options import echo_json, json_option, overwrite_option, run_options, seeds_option
 from corrsfm.config import RunConfig
 
 __all__ = ["command_line", "evaluate"]
@@ -165,23 +165,42 @@ def homography(
     help="COLMAP model, or folder of camera files PHOTO.json with the rotation (3 × 3) and translation (3) "
     "of cam_from_world.",
 )
+@seeds_option
+@run_options
 @json_option
-def scene(workspace_dir: Path, ground_truth: Path, as_json: bool) -> None:
-    """Compare a reconstruction with known cameras. WORKSPACE may also be a COLMAP model."""
-    from corrsfm.evaluation.scenes.score import evaluate_scene
+def scene(workspace_dir: Path, ground_truth: Path, num_seeds: int, run: RunConfig, as_json: bool) -> None:
+    """Compare a reconstruction with known cameras. WORKSPACE may also be a COLMAP model.
 
-    score = evaluate_scene(workspace_dir, ground_truth)
+    A workspace is also mapped with further seeds, in WORKSPACE/.seeds: a single model is one draw. Its own
+    seed is that of run.json, or --seed if it was made step by step.
+    """
+    from corrsfm.evaluation.scenes.score import evaluate_scene
+    from corrsfm.evaluation.scenes.seeds import evaluate_seeds, why_one_model
+    from corrsfm.evaluation.tables import render_table
+
+    why = why_one_model(workspace_dir) if num_seeds > 1 else "--seeds 1"
+    values = (
+        evaluate_scene(workspace_dir, ground_truth).to_dict()
+        if why
+        else evaluate_seeds(workspace_dir, ground_truth, num_seeds, run)
+    )
     if as_json:
-        echo_json(score.to_dict())
+        echo_json(values)
         return
-    click.echo(f"registered          {score.num_registered} of {score.num_photos} photos")
-    for threshold, value in score.auc.items():
-        click.echo(f"pose AUC@{threshold + '°':<11}{value:.1f} %")
-    if score.position_error_mean is None:
-        click.echo("position error      undetermined: fewer than 3 registered photos, or all on a line")
-    else:
-        click.echo(
-            f"position error      mean {score.position_error_mean:.4g}, "
-            f"median {score.position_error_median:.4g}, max {score.position_error_max:.4g} "
-            f"in units of the ground truth (mean {score.position_error_percent:.2f} % of its extent)"
-        )
+    for line in _score_lines(values):
+        click.echo(line)
+    click.echo(f"\none model: {why}" if why else "\n" + render_table({"kind": "scene", **values}))
+
+
+def _score_lines(score: dict[str, Any]) -> Iterator[str]:
+    yield f"registered          {score['num_registered']} of {score['num_photos']} photos"
+    for threshold, value in score["auc"].items():
+        yield f"pose AUC@{threshold + '°':<11}{value:.1f} %"
+    if score["position_error_mean"] is None:
+        yield "position error      undetermined: fewer than 3 registered photos, or all on a line"
+        return
+    yield (
+        f"position error      mean {score['position_error_mean']:.4g}, "
+        f"median {score['position_error_median']:.4g}, max {score['position_error_max']:.4g} "
+        f"in units of the ground truth (mean {score['position_error_percent']:.2f} % of its extent)"
+    )

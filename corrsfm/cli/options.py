@@ -18,6 +18,7 @@ from click.core import ParameterSource
 from corrsfm import config as cfg
 from corrsfm.cli.sections import SectionedOption, section_of
 from corrsfm.config.fields import flag_of
+from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
 
 __all__ = [
     "OVERWRITE_KEY",
@@ -28,6 +29,7 @@ __all__ = [
     "pipeline_options",
     "recipe_options",
     "run_options",
+    "seeds_option",
     "usage_options",
 ]
 
@@ -235,6 +237,18 @@ def overwrite_option(command: F) -> F:
         is_flag=True,
         callback=note,
         help="Redo finished work; without it only what is missing or stale is done.",
+    )(command)
+
+
+def seeds_option(command: F) -> F:
+    """``--seeds``; the command is called with ``num_seeds``."""
+    return click.option(
+        "--seeds",
+        "num_seeds",
+        type=click.IntRange(min=1),
+        default=DEFAULT_NUM_SEEDS,
+        show_default=True,
+        help="Seeds to map with, for the median and the worst; 1 is quick, but one draw.",
     )(command)
 
 

@@ -16,6 +16,9 @@
     │   └── homography.py       filters on folders in the layout of HPatches
     └── scenes/              whole reconstructions
         ├── score.py            one reconstruction against known cameras
+        ├── evidence.py         what models explain and predict, counted alike for all
+        ├── sharing.py          workspaces that start from the same files
+        ├── seeds.py            one scene under several seeds: median and worst
         ├── compare.py          one scene under several prune methods, side by side
         └── page.py             the HTML page of a comparison
 """

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from corrsfm.errors import InputError
 
-__all__ = ["Table", "build_table", "render_table"]
+__all__ = ["Table", "build_table", "grades_text", "median_and_worst", "render_table"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,15 +102,34 @@ def _homography_table(values: dict[str, Any]) -> Table:
     return Table(header=header, rows=rows, caption=f"{count} sequences. {_origin(values)}")
 
 
+def median_and_worst(method: dict[str, Any], value: Callable[[dict[str, Any]], float], spec: str) -> str:
+    """A number of a method as "median (worst)" over its seeds, each formatted as ``spec`` says."""
+    return f"{value(method['median']):{spec}} ({value(method['worst']):{spec}})"
+
+
+def grades_text(seeds: Sequence[dict[str, Any]]) -> str:
+    """The verdicts on the models of some seeds, such as "3 good, 2 doubtful"; a dash if there are none."""
+    # Old result files have tables without it, and it is slow to import.
+    from corrsfm.reconstruction.verdict import Grade
+
+    grades = Counter("failed" if seed["failure"] else seed["grade"] for seed in seeds)
+    return ", ".join(f"{grades[grade]} {grade}" for grade in (*Grade, "failed") if grades[grade]) or "–"
+
+
 def _compare_table(values: dict[str, Any]) -> Table:
-    truth = any(method.get("ground_truth") for method in values["methods"].values())
+    methods = values["methods"]
+    num_seeds = min(len(method.get("seeds", [])) for method in methods.values())
+    if num_seeds > 1:
+        return _compare_seeds_table(values, num_seeds)
+    truth = any(method.get("ground_truth") for method in methods.values())
     header = [
         "method", "verified pairs", "inlier ratio", "photos", "points", "track length", "error px",
         "prune s", "map s",
     ]  # fmt: skip
     header += ["AUC@1", "AUC@5", "AUC@10", "position error %"] if truth else []
+    header += ["explained %", "predicted", "verdict"] if num_seeds else []
     rows = []
-    for name, m in values["methods"].items():
+    for name, m in methods.items():
         row = [
             name,
             str(m["num_verified_pairs"]),
@@ -126,8 +145,72 @@ def _compare_table(values: dict[str, Any]) -> Table:
             score = m.get("ground_truth") or {}
             row += [_number(score.get("auc", {}).get(t)) for t in ("1", "5", "10")]
             row.append(_number(score.get("position_error_percent"), 2))
+        if num_seeds:
+            row += _seed_cells(m["seeds"][0])[-3:]
         rows.append(row)
     return Table(header=header, rows=rows, caption=_origin(values))
+
+
+def _compare_seeds_table(values: dict[str, Any], num_seeds: int) -> Table:
+    """Median and worst of each method; narrow enough for a terminal, the page has the rest."""
+    methods = values["methods"]
+    truth = all("auc" in method["median"] for method in methods.values())
+    header = ["method", "photos", "points", "explained %", "predicted"]
+    header += ["AUC@5", "verdicts"] if truth else ["verdicts"]
+    rows = []
+    for name, method in methods.items():
+        row = [
+            name,
+            median_and_worst(method, lambda m: m["num_registered"], ".0f"),
+            median_and_worst(method, lambda m: m["num_points"], ".0f"),
+            median_and_worst(method, lambda m: 100.0 * m["explained_share"], ".0f"),
+            median_and_worst(method, lambda m: m["num_predicted_matches"], ".0f"),
+        ]
+        row += [median_and_worst(method, lambda m: m["auc"]["5"], ".1f")] if truth else []
+        rows.append([*row, grades_text(method["seeds"])])
+    caption = (
+        f"Median (worst) of {num_seeds} seeds from {values['provenance']['seed']} on, "
+        f"{values['subject']['num_photos']} photos. {_libraries(values)}."
+    )
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _seed_cells(seed: dict[str, Any]) -> list[str]:
+    """Photos, points, explained share, predicted matches and verdict on one model."""
+    return [
+        str(seed["num_registered"]),
+        str(seed["num_points"]),
+        _number(100.0 * seed["explained_share"]),
+        str(seed["num_predicted_matches"]),
+        grades_text([seed]).removeprefix("1 "),
+    ]
+
+
+def _scene_table(values: dict[str, Any]) -> Table:
+    """Every seed of one scene, then the median and the worst."""
+    rows = []
+    for seed in values["seeds"]:
+        photos, points, explained, predicted, grade = _seed_cells(seed)
+        auc = [_number(value) for value in seed["ground_truth"]["auc"].values()]
+        rows.append([str(seed["seed"]), photos, points, explained, predicted, *auc, grade])
+    for name in ("median", "worst"):
+        summary = values[name]
+        row = [
+            name,
+            _number(summary["num_registered"], 0),
+            _number(summary["num_points"], 0),
+            _number(100.0 * summary["explained_share"]),
+            _number(summary["num_predicted_matches"], 0),
+            *(_number(value) for value in summary["auc"].values()),
+        ]
+        rows.append([*row, grades_text(values["seeds"]) if name == "median" else ""])
+    header = ["seed", "photos", "points", "explained %", "predicted"]
+    header += [f"AUC@{threshold}" for threshold in values["median"]["auc"]]
+    return Table(
+        header=[*header, "verdict"],
+        rows=rows,
+        caption=f"The workspace's own model is that of seed {values['seeds'][0]['seed']}.",
+    )
 
 
 def _pycolmap_table(values: dict[str, Any]) -> Table:
@@ -213,8 +296,12 @@ def _bench_table(values: dict[str, Any]) -> Table:
 
 def _origin(values: dict[str, Any]) -> str:
     """Origin of a table for its caption: versions and seed."""
+    return f"{_libraries(values)}; seed {values['provenance']['seed']}."
+
+
+def _libraries(values: dict[str, Any]) -> str:
     versions = values["provenance"]["versions"]
-    libraries = ", ".join(
+    return ", ".join(
         f"{name} {versions[key]}"
         for name, key in (
             ("corrsfm", "corrsfm"),
@@ -224,13 +311,13 @@ def _origin(values: dict[str, Any]) -> str:
         )
         if key in versions
     )
-    return f"{libraries}; seed {values['provenance']['seed']}."
 
 
 _RENDERERS: dict[str, Callable[[dict[str, Any]], Table]] = {
     "pose": _pose_table,
     "homography": _homography_table,
     "compare": _compare_table,
+    "scene": _scene_table,
     "pycolmap": _pycolmap_table,
     "bench": _bench_table,
     "scene_seeds": _seeds_table,

@@ -33,6 +33,7 @@ __all__ = [
     "PrunerProtocol",
     "build_pruner",
     "checkpoint_sha256",
+    "depends_on_seed",
     "make_correspondences",
     "side_information",
 ]
@@ -117,6 +118,11 @@ def build_pruner(
         seed=seed,
         threads=threads,
     )
+
+
+def depends_on_seed(config: PruneConfig) -> bool:
+    """Whether what a config's method keeps depends on the seed: only robust estimators draw at random."""
+    return config.method in (PruneMethod.LORANSAC, PruneMethod.MAGSAC)
 
 
 def checkpoint_sha256(config: PruneConfig) -> str | None:

@@ -18,6 +18,7 @@
     ├── sparse.old/         models of earlier matches, moved here when mapping failed
     ├── warnings.json       what each stage warned of
     ├── report.json, report.html
+    ├── .seeds/SEED/        workspaces of further seeds, for `corrsfm compare` and `corrsfm evaluate scene`
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
 
@@ -119,6 +120,7 @@ class Workspace:
         self.evidence = root / "evidence.json"
         self.candidates = root / ".candidates"
         self.warnings_json = root / "warnings.json"
+        self.seeds = root / ".seeds"
         self.report_json = root / "report.json"
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"

@@ -45,7 +45,7 @@ def flags_of_table(table: str) -> list[str]:
         ),
         (
             "compare",
-            ["--methods", "--output", "--ground-truth", "--max-features", "--pipeline"],
+            ["--methods", "--seeds", "--output", "--ground-truth", "--max-features", "--pipeline"],
             [*STAGES, "run"],
         ),
         ("extract", ["--max-features", "--camera-mode", "--pairing"], [*STAGES[:4], "run"]),

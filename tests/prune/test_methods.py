@@ -7,7 +7,7 @@ import pytest
 from two_view_pairs import CAMERA, make_pair
 
 from corrsfm.config import Precision, PruneConfig, PruneMethod
-from corrsfm.prune import build_pruner, make_correspondences, side_information
+from corrsfm.prune import build_pruner, depends_on_seed, make_correspondences, side_information
 from corrsfm.types import Correspondences, Features, Matches, PruneResult
 
 METHODS = ["none", "ratio", "loransac", "magsac", "corradaptor", "cascade"]
@@ -61,6 +61,13 @@ def assert_sound(result, pair):
 def test_pruner_has_the_name_of_its_method(pruner):
     assert pruner.name in METHODS
     assert pruner.name in pruner.fingerprint
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_methods_whose_results_depend_on_the_seed_are_known(method):
+    config = PruneConfig(method=PruneMethod(method))
+    pruners = [build_pruner(config, device="cpu", seed=seed, threads=1) for seed in (0, 1)]
+    assert depends_on_seed(config) == (pruners[0].fingerprint != pruners[1].fingerprint)
 
 
 def test_pruner_of_no_pairs_gives_no_results(pruner):

@@ -5,6 +5,7 @@
     OUTPUT/
     ├── base/            workspace: photos, features, pairs, matches
     ├── METHOD/ …        one workspace each, sharing the base's files, from pruning to models
+    │   └── .seeds/SEED/ …      the same again for each further seed, see `corrsfm.evaluation.scenes.seeds`
     ├── compare.json     what was measured
     └── compare.html     the same, with the pairs that differ most drawn
 
@@ -14,10 +15,9 @@ that every command accepts. Finished work is kept.
 
 from __future__ import annotations
 
+import dataclasses
 import logging
-import os
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -25,49 +25,35 @@ from typing import Any
 import numpy as np
 
 from corrsfm import pipeline
-from corrsfm.config import PipelineConfig, PruneConfig, to_dict
-from corrsfm.errors import ConfigError, ReconstructionError
+from corrsfm.config import PipelineConfig, to_dict
+from corrsfm.errors import ConfigError
 from corrsfm.evaluation.records import finite_or_none, provenance, save_results
-from corrsfm.evaluation.scenes.score import evaluate_scene, read_poses, score_poses
+from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
+from corrsfm.evaluation.scenes.evidence import common_evidence
+from corrsfm.evaluation.scenes.score import read_truth, require_common_names
+from corrsfm.evaluation.scenes.seeds import (
+    SeedRun,
+    map_other_seeds,
+    measure_seed,
+    seconds_of,
+    summarise_seeds,
+    verify_and_map,
+    wanted_seeds,
+)
+from corrsfm.evaluation.scenes.sharing import share_stages
 from corrsfm.evaluation.two_view.filters import parse_prune_method
 from corrsfm.types import ModelSummary, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs
 
-__all__ = ["compare_methods", "method_folder", "share_matches"]
+__all__ = ["compare_methods", "method_folder"]
 
 logger = logging.getLogger("corrsfm")
-
-_SHARED_STAGES = ("images", "features", "pairs", "matches")
 
 
 def method_folder(method: str) -> str:
     """Folder name of a method, safe on every file system."""
     return re.sub(r"[^A-Za-z0-9.-]+", "_", method).strip("._") or "_"
-
-
-def share_matches(base: Workspace, target: Workspace) -> None:
-    """Give a workspace the photos, features, pairs and matches of another without copying them.
-
-    What was made from a stage stays valid while the record of the stage is unchanged.
-    """
-    target.images_dir = base.images_dir
-    files = ("images_txt", "images_json", "features", "pairs", "pair_origins", "matches")
-    for name in files:
-        source, link = getattr(base, name), getattr(target, name)
-        if link.exists() and os.path.samefile(source, link):
-            continue
-        link.unlink(missing_ok=True)
-        try:
-            os.link(source, link)
-        except OSError:
-            # Some file systems have no hard links.
-            shutil.copy2(source, link)
-    for stage in _SHARED_STAGES:
-        record = base.require(stage)
-        known = target.record_of(stage)
-        if known is None or known.fingerprint != record.fingerprint:
-            target.finish(stage, record)
 
 
 def compare_methods(
@@ -76,12 +62,13 @@ def compare_methods(
     methods: Sequence[str],
     config: PipelineConfig,
     *,
+    num_seeds: int = DEFAULT_NUM_SEEDS,
     ground_truth: Path | None = None,
     results: Path | None = None,
     overwrite: bool = False,
     command: str = "",
 ) -> dict[str, Any]:
-    """Reconstruct a scene once per prune method and measure each.
+    """Reconstruct a scene with each prune method, over several seeds, and measure.
 
     Parameters
     ----------
@@ -93,6 +80,9 @@ def compare_methods(
         ``METHOD[@POINT][:CHECKPOINT]``, methods of `corrsfm prune`.
     config : PipelineConfig
         Options of all stages; a method's name overrides those of pruning.
+    num_seeds : int
+        Seeds that each method is mapped with, counted up from that of the config. What a result holds beside
+        ``seeds``, ``median`` and ``worst`` is of the first.
     ground_truth : Path, optional
         See `corrsfm.evaluation.scenes.score.read_poses`.
     results : Path, optional
@@ -118,20 +108,30 @@ def compare_methods(
     folders = [method_folder(method) for method in prune_configs]
     if not folders or len(set(folders)) < len(folders) or "base" in folders:
         raise ConfigError(f"methods {', '.join(methods)}: give at least one, and each only once")
+    wanted_seeds(config.run.seed, num_seeds)
+    truth = read_truth(ground_truth) if ground_truth else None
     base = Workspace(output / "base", create=True)
     _prepare(base, images_dir, config, overwrite)
-    workspaces = {}
-    measured = {}
-    for method, prune_config in prune_configs.items():
-        logger.info("method %s", method)
-        workspace = Workspace(output / method_folder(method), create=True)
-        failure = _reconstruct(base, workspace, prune_config, config, overwrite)
-        workspaces[method] = workspace
-        measured[method] = {
-            "config": to_dict(prune_config),
-            **_measure(workspace, failure, ground_truth),
-        }
     index = read_index(base)
+    if truth is not None and ground_truth is not None:
+        require_common_names(index.names, images_dir, truth, ground_truth)
+    runs = {
+        method: _reconstruct(
+            base, output, method, dataclasses.replace(config, prune=prune_config), num_seeds, overwrite
+        )
+        for method, prune_config in prune_configs.items()
+    }
+    workspaces = {method: seeds[0].workspace for method, seeds in runs.items()}
+    logger.info("counting what the models predict")
+    everything = [run.workspace for seeds in runs.values() for run in seeds]
+    with common_evidence(everything, seed=config.run.seed) as evidence:
+        measured = {
+            method: {
+                "config": to_dict(prune_configs[method]),
+                **_measure(seeds[0], [measure_seed(run, evidence, truth) for run in seeds]),
+            }
+            for method, seeds in runs.items()
+        }
     values = {
         "provenance": provenance(seed=config.run.seed, command=command, device=config.run.device),
         "subject": {
@@ -167,37 +167,40 @@ def _prepare(base: Workspace, images_dir: Path, config: PipelineConfig, overwrit
 
 
 def _reconstruct(
-    base: Workspace, workspace: Workspace, prune: PruneConfig, config: PipelineConfig, overwrite: bool
-) -> str | None:
-    """Run everything from pruning on; returns the reason if mapping fails, else None."""
+    base: Workspace,
+    output: Path,
+    method: str,
+    config: PipelineConfig,
+    num_seeds: int,
+    overwrite: bool,
+) -> list[SeedRun]:
+    """Run everything from pruning on, for every seed."""
+    workspace = Workspace(output / method_folder(method), create=True)
+    subject = f"method {method}"
     with workspace.lock():
-        share_matches(base, workspace)
-        pipeline.prune_matches(workspace, prune, config.run, overwrite=overwrite)
-        pipeline.verify_matches(workspace, config.database, config.run, overwrite=overwrite)
-        try:
-            pipeline.reconstruct(workspace, config.reconstruction, config.run, overwrite=overwrite)
-        except ReconstructionError as error:
-            return str(error)
-    return None
+        logger.info("%s", subject if num_seeds == 1 else f"{subject}, seed 1 of {num_seeds}")
+        share_stages(base, workspace)
+        pipeline.prune_matches(workspace, config.prune, config.run, overwrite=overwrite)
+        failure = verify_and_map(workspace, config, overwrite=overwrite)
+        return [
+            SeedRun(seed=config.run.seed, workspace=workspace, failure=failure),
+            *map_other_seeds(workspace, config, num_seeds, overwrite=overwrite, subject=subject),
+        ]
 
 
-def _measure(workspace: Workspace, failure: str | None, ground_truth: Path | None) -> dict[str, Any]:
-    """Numbers of one method's reconstruction."""
+def _measure(run: SeedRun, seeds: list[dict[str, Any]]) -> dict[str, Any]:
+    """Numbers of one method: of its first seed, and of all of them."""
     from corrsfm.colmap.pairs import read_verified_pairs
 
+    workspace = run.workspace
     pairs = read_verified_pairs(workspace.database)
     verified = [pair for pair in pairs if pair.num_inliers > 0]
     kept = sum(pair.num_matches for pair in pairs)
     inliers = sum(pair.num_inliers for pair in pairs)
-    models = [] if failure else _models(workspace)
+    models = [] if run.failure else _models(workspace)
     largest = models[0] if models else None
-    score = _score(workspace, ground_truth, failed=largest is None) if ground_truth else None
-    seconds = {
-        name: _seconds(workspace, stage)
-        for name, stage in (("prune", "pruned matches"), ("verify", "verified matches"), ("map", "models"))
-    }
     return {
-        "failure": failure,
+        "failure": run.failure,
         "num_kept_matches": kept,
         "num_inlier_matches": inliers,
         "num_verified_pairs": len(verified),
@@ -213,17 +216,11 @@ def _measure(workspace: Workspace, failure: str | None, ground_truth: Path | Non
         "num_observations": largest.num_observations if largest else 0,
         "mean_track_length": finite_or_none(largest.mean_track_length) if largest else None,
         "mean_error_px": finite_or_none(largest.mean_error_px) if largest else None,
-        "ground_truth": score,
-        "seconds": seconds,
+        "ground_truth": seeds[0]["ground_truth"],
+        "seconds": seconds_of(workspace),
+        "seeds": seeds,
+        **summarise_seeds(seeds),
     }
-
-
-def _score(workspace: Workspace, ground_truth: Path, *, failed: bool) -> dict[str, Any]:
-    """Score against known cameras; without a model every photo is missing."""
-    score = (
-        score_poses({}, read_poses(ground_truth)) if failed else evaluate_scene(workspace.root, ground_truth)
-    )
-    return score.to_dict()
 
 
 def _models(workspace: Workspace) -> list[ModelSummary]:
@@ -231,11 +228,6 @@ def _models(workspace: Workspace) -> list[ModelSummary]:
     from corrsfm.colmap.models import read_models, summarise_model
 
     return [summarise_model(model) for model in read_models(workspace.sparse)]
-
-
-def _seconds(workspace: Workspace, stage: str) -> float | None:
-    record = workspace.record_of(stage)
-    return round(record.seconds, 3) if record else None
 
 
 def _pair_counts(base: Workspace, workspaces: dict[str, Workspace]) -> list[dict[str, Any]]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.evaluation.tables import grades_text, median_and_worst
 from corrsfm.files import atomic_write_text
 from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
 from corrsfm.report.style import frame, section
@@ -39,11 +40,27 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
     ("verify s", lambda m: m["seconds"]["verify"], 1, -1),
     ("map s", lambda m: m["seconds"]["map"], 1, -1),
 )
+_ONE_SEED_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
+    ("explained %", lambda m: 100.0 * m["seeds"][0]["explained_share"], 1, 1),
+    ("predicted", lambda m: m["seeds"][0]["num_predicted_matches"], 0, 1),
+)
 _TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
     ("AUC@1°", lambda m: m["ground_truth"]["auc"]["1"], 1, 1),
     ("AUC@5°", lambda m: m["ground_truth"]["auc"]["5"], 1, 1),
     ("AUC@10°", lambda m: m["ground_truth"]["auc"]["10"], 1, 1),
     ("position error %", lambda m: m["ground_truth"]["position_error_percent"], 2, -1),
+)
+_SEED_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], str], ...] = (
+    # heading, value of one seed, a median or a worst, and its format; more is better
+    ("photos", lambda s: s["num_registered"], ",g"),
+    ("points", lambda s: s["num_points"], ",.0f"),
+    ("explained %", lambda s: 100.0 * s["explained_share"], ".1f"),
+    ("predicted", lambda s: s["num_predicted_matches"], ",.0f"),
+)
+_SEED_TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], str], ...] = (
+    ("AUC@1°", lambda s: _auc_of(s)["1"], ".1f"),
+    ("AUC@5°", lambda s: _auc_of(s)["5"], ".1f"),
+    ("AUC@10°", lambda s: _auc_of(s)["10"], ".1f"),
 )
 
 
@@ -66,6 +83,14 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
         f"{subject['num_photos']} photos, {subject['num_pairs']} pairs; the same features and matches for "
         "every method. Numbers of the largest model; the best of a column is bold."
     )
+    num_seeds = len(next(iter(values["methods"].values()))["seeds"])
+    if num_seeds > 1:
+        tables = [
+            section(f"Median (worst) of {num_seeds} seeds", _seeds(values["methods"])),
+            section(f"Seed {provenance['seed']} in detail", _table(values["methods"])),
+        ]
+    else:
+        tables = [section("Methods", _table(values["methods"]))]
     legend = (
         "<p class='note'>By number of verified matches. <span class='kept'>Blue: kept</span>, "
         "<span class='dropped'>orange: dropped</span>; at most 150 and 60 are drawn.</p>"
@@ -73,7 +98,7 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
     drawn = _drawn_pairs(values["pairs"][:_NUM_DRAWN_PAIRS], base, workspaces)
     origin = f"{escape(versions)}; seed {provenance['seed']}. {escape(provenance['command'])}"
     body = [
-        section("Methods", _table(values["methods"])),
+        *tables,
         section("Pairs that differ most", legend + "\n".join(drawn)),
         f"<p class='note'>{origin}</p>",
     ]
@@ -81,27 +106,93 @@ def write_page(path: Path, values: dict[str, Any], base: Workspace, workspaces: 
     atomic_write_text(path, frame(title, subtitle, "\n".join(body)))
 
 
+def _seeds(methods: dict[str, Any]) -> str:
+    """The median and the worst of each method, and every model."""
+    columns = [*_SEED_COLUMNS]
+    if all("auc" in method["median"] for method in methods.values()):
+        columns += _SEED_TRUTH_COLUMNS
+    best = [_best([value(method["median"]) for method in methods.values()], 1) for _, value, _ in columns]
+    medians, models = [], []
+    for name, method in methods.items():
+        cells = [
+            _cell(
+                median_and_worst(method, value, spec).replace(" ", "\N{NO-BREAK SPACE}"),
+                best=value(method["median"]) == winner,
+            )
+            for (_, value, spec), winner in zip(columns, best, strict=True)
+        ]
+        medians.append(_row(_cell(name), *cells, _cell(grades_text(method["seeds"]))))
+        models += [_model(name, seed, columns) for seed in method["seeds"]]
+    headings = [heading for heading, *_ in columns]
+    note = (
+        "<p class='note'>Mapping depends on the seed. Explained: verified matches that agree with the model. "
+        "Predicted: matches along the epipolar lines that its poses draw, in the same pairs of photos for "
+        "all models. A seed without a model counts as no photo and an AUC of 0.</p>"
+    )
+    every = _numbers(["method", "seed", *headings, "contradicted pairs", "map s", "verdict"], models)
+    return (
+        f"{note}{_numbers(['method', *headings, 'verdicts'], medians)}"
+        f"<details><summary>every model</summary>{every}</details>"
+    )
+
+
+def _model(
+    method: str, seed: dict[str, Any], columns: Sequence[tuple[str, Callable[[dict[str, Any]], Any], str]]
+) -> str:
+    cells = [_cell(f"{value(seed):{spec}}") for _, value, spec in columns]
+    cells += [_cell(str(seed["num_contradicted_pairs"])), _cell(_number(seed["seconds"]["map"], 1))]
+    verdict = grades_text([seed]).removeprefix("1 ")
+    row = _row(_cell(method), _cell(str(seed["seed"])), *cells, _cell(verdict))
+    return row + _failure(seed["failure"], 3 + len(cells))
+
+
+def _auc_of(values: dict[str, Any]) -> dict[str, float]:
+    """AUC by threshold of a summary over seeds, or of one seed."""
+    return values["auc"] if "auc" in values else values["ground_truth"]["auc"]
+
+
 def _table(methods: dict[str, Any]) -> str:
-    columns = list(_COLUMNS)
+    columns = [*_COLUMNS]
+    if all(len(method["seeds"]) == 1 for method in methods.values()):
+        columns += _ONE_SEED_COLUMNS
     if all(method["ground_truth"] for method in methods.values()):
         columns += _TRUTH_COLUMNS
     best = [_best([value(m) for m in methods.values()], sense) for _, value, _, sense in columns]
-    head = "".join(f"<th>{escape(heading)}</th>" for heading, *_ in columns)
     rows = []
     for name, method in methods.items():
-        cells = []
-        for (_, value, decimals, _), winner in zip(columns, best, strict=True):
-            number = value(method)
-            text = "–" if number is None else f"{number:,.{decimals}f}"
-            kind = " class='best'" if number is not None and number == winner else ""
-            cells.append(f"<td{kind}>{text}</td>")
-        rows.append(f"<tr><td>{escape(name)}</td>{''.join(cells)}</tr>")
-        if method["failure"]:
-            rows.append(
-                f"<tr><td class='failure' colspan='{len(columns) + 1}'>{escape(method['failure'])}</td></tr>"
-            )
-    head_row = f"<tr><th>method</th>{head}</tr>"
-    return f"<div class='scroll'><table class='numbers'>{head_row}{''.join(rows)}</table></div>"
+        cells = [
+            _cell(_number(value(method), decimals), best=winner is not None and value(method) == winner)
+            for (_, value, decimals, _), winner in zip(columns, best, strict=True)
+        ]
+        rows.append(_row(_cell(name), *cells))
+        rows.append(_failure(method["failure"], len(columns) + 1))
+    return _numbers(["method", *(heading for heading, *_ in columns)], rows)
+
+
+def _failure(reason: str | None, num_columns: int) -> str:
+    """A row with the reason why mapping failed; nothing if it did not."""
+    if not reason:
+        return ""
+    return _row(f"<td class='failure' colspan='{num_columns}'>{escape(reason)}</td>")
+
+
+def _number(number: float | None, decimals: int) -> str:
+    return "–" if number is None else f"{number:,.{decimals}f}"
+
+
+def _cell(text: str, *, best: bool = False) -> str:
+    kind = " class='best'" if best else ""
+    return f"<td{kind}>{escape(text)}</td>"
+
+
+def _row(*cells: str) -> str:
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _numbers(headings: Sequence[str], rows: Sequence[str]) -> str:
+    """A table of numbers that scrolls where the page is narrow."""
+    head = _row(*(f"<th>{escape(heading)}</th>" for heading in headings))
+    return f"<div class='scroll'><table class='numbers'>{head}{''.join(rows)}</table></div>"
 
 
 def _best(numbers: Sequence[float | None], sense: int) -> float | None:

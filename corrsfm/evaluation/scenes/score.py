@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,16 @@ from corrsfm.evaluation.metrics import pose_auc, position_errors, relative_pose_
 from corrsfm.geometry import Pose, camera_centre
 from corrsfm.workspace import Workspace
 
-__all__ = ["SCENE_THRESHOLDS_DEG", "SceneScore", "evaluate_scene", "find_model", "read_poses", "score_poses"]
+__all__ = [
+    "SCENE_THRESHOLDS_DEG",
+    "SceneScore",
+    "evaluate_scene",
+    "find_model",
+    "read_poses",
+    "read_truth",
+    "require_common_names",
+    "score_poses",
+]
 
 SCENE_THRESHOLDS_DEG = (1.0, 5.0, 10.0)
 
@@ -109,6 +118,48 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     return {path.relative_to(folder).as_posix().removesuffix(".json"): _read_camera(path) for path in files}
 
 
+def read_truth(folder: Path) -> dict[str, Pose]:
+    """Known cameras, see `read_poses`.
+
+    Raises
+    ------
+    InputError
+        If they cannot be read, or are fewer than two.
+    """
+    truth = read_poses(folder)
+    if len(truth) < 2:
+        raise InputError(f"{folder}: only {len(truth)} known cameras; at least 2 are needed to compare poses")
+    return truth
+
+
+def require_common_names(
+    names: Collection[str], source: Path, truth: Collection[str], ground_truth: Path
+) -> None:
+    """Check that a scene and its known cameras are about the same photos.
+
+    Parameters
+    ----------
+    names : collection of str
+        Photos of the scene.
+    source : Path
+        Where they are, for the message.
+    truth : collection of str
+        Photos with known cameras.
+    ground_truth : Path
+        Where these are.
+
+    Raises
+    ------
+    InputError
+        If they have no name in common.
+    """
+    if set(names).isdisjoint(truth):
+        raise InputError(
+            f"{source} and {ground_truth} share no photo name (such as '{next(iter(names), 'none')}' and "
+            f"'{next(iter(truth))}'); names must be paths relative to the same image folder"
+        )
+
+
 def _read_camera(path: Path) -> Pose:
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -174,15 +225,7 @@ def evaluate_scene(model: Path, ground_truth: Path) -> SceneScore:
     InputError
         If one cannot be read, they share no photo, or fewer than two cameras are known.
     """
-    truth = read_poses(ground_truth)
-    if len(truth) < 2:
-        raise InputError(
-            f"{ground_truth}: only {len(truth)} known cameras; at least 2 are needed to compare poses"
-        )
+    truth = read_truth(ground_truth)
     poses = read_poses(find_model(model))
-    if not poses.keys() & truth.keys():
-        raise InputError(
-            f"{model} and {ground_truth} share no photo name (such as '{next(iter(poses), 'none')}' and "
-            f"'{next(iter(truth))}'); names must be paths relative to the same image folder"
-        )
+    require_common_names(poses, model, truth, ground_truth)
     return score_poses(poses, truth)

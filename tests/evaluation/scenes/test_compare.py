@@ -3,48 +3,35 @@
 import json
 import os
 import re
+import statistics
 from pathlib import Path
 
-import pycolmap
 import pytest
 from click.testing import CliRunner
 from photos import write_photos
+from rendered_scene import CONFIG, render_scene
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.cli import main
-from corrsfm.errors import ConfigError
+from corrsfm.errors import ConfigError, InputError, ReconstructionError
 from corrsfm.evaluation.records import load_results
-from corrsfm.evaluation.scenes.compare import compare_methods, method_folder, share_matches
+from corrsfm.evaluation.scenes.compare import compare_methods, method_folder
+from corrsfm.evaluation.scenes.sharing import share_stages
 from corrsfm.evaluation.tables import render_table
+from corrsfm.reconstruction import stage as reconstruction_stage
 from corrsfm.workspace import Workspace
 
-CONFIG = cfg.PipelineConfig(
-    images=cfg.ImagesConfig(camera_model="SIMPLE_PINHOLE", camera_params="1280,512,384"),
-    features=cfg.FeaturesConfig(max_features=700),
-    run=cfg.RunConfig(threads=1, device="cpu"),
-)
+METHODS = ["ratio", "loransac"]
 
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("scene")
-    (folder / "images").mkdir()
-    (folder / "truth").mkdir()
-    pycolmap.set_random_seed(3)
-    model = pycolmap.synthesize_dataset(
-        pycolmap.SyntheticDatasetOptions(
-            num_rigs=1, num_frames_per_rig=4, num_points3D=300, camera_width=1024, camera_height=768,
-            camera_model_id=pycolmap.CameraModelId.SIMPLE_PINHOLE, camera_params=[1280, 512, 384],
-        )
-    )  # fmt: skip
-    pycolmap.synthesize_images(
-        pycolmap.SyntheticImageOptions(feature_patch_radius=15), model, str(folder / "images")
-    )
-    model.write_text(str(folder / "truth"))
+    images, truth = render_scene(folder)
     values = compare_methods(
-        folder / "images", folder / "out", ["ratio", "loransac"], CONFIG,
-        ground_truth=folder / "truth", results=folder / "results" / "made_up.json", command="corrsfm compare",
+        images, folder / "out", METHODS, CONFIG, num_seeds=3,
+        ground_truth=truth, results=folder / "results" / "made_up.json", command="corrsfm compare",
     )  # fmt: skip
     return folder, values
 
@@ -82,6 +69,40 @@ def test_pairs_that_differ_most_come_first(compared: tuple[Path, dict]):
         assert verified == values["methods"][method]["num_inlier_matches"]
 
 
+def test_every_seed_of_a_method_is_measured(compared: tuple[Path, dict]):
+    folder, values = compared
+    for name, method in values["methods"].items():
+        assert [seed["seed"] for seed in method["seeds"]] == [0, 1, 2]
+        own = method["seeds"][0]
+        for key in ("num_registered", "num_points", "ground_truth", "seconds", "failure"):
+            assert own[key] == method[key]
+        for seed in method["seeds"]:
+            workspace = folder / "out" / name
+            if seed["seed"]:
+                workspace = workspace / ".seeds" / str(seed["seed"])
+            evidence = json.loads((workspace / "evidence.json").read_text())
+            assert seed["explained_share"] == evidence["explained_share"] > 0.5
+            assert seed["grade"] == evidence["verdict"]["grade"]
+            assert seed["num_contradicted_pairs"] == len(evidence["contradicted_pairs"])
+            assert seed["num_predicted_matches"] > 100
+            assert evidence["num_predicted_matches"] in (None, seed["num_predicted_matches"])
+        for key in ("num_points", "explained_share", "num_predicted_matches"):
+            found = [seed[key] for seed in method["seeds"]]
+            assert method["median"][key] == statistics.median(found) and method["worst"][key] == min(found)
+        found = [seed["ground_truth"]["auc"]["5"] for seed in method["seeds"]]
+        assert method["median"]["auc"]["5"] == statistics.median(found)
+        assert method["worst"]["auc"]["5"] == min(found)
+
+
+def test_seeds_share_what_does_not_depend_on_them(compared: tuple[Path, dict]):
+    folder, _ = compared
+    for method, num_kept_files in (("ratio", 1), ("loransac", 3)):
+        places = [folder / "out" / method / place for place in (".", ".seeds/1", ".seeds/2")]
+        assert len({os.stat(place / "features.h5").st_ino for place in places}) == 1
+        assert len({os.stat(place / "pruned.h5").st_ino for place in places}) == num_kept_files
+        assert len({(place / "database.db").read_bytes() for place in places}) == 3
+
+
 def test_results_page_and_table_hold_the_same_numbers(compared: tuple[Path, dict]):
     folder, values = compared
     stored = load_results(folder / "results" / "made_up.json", "compare")
@@ -90,33 +111,105 @@ def test_results_page_and_table_hold_the_same_numbers(compared: tuple[Path, dict
     page = (folder / "out" / "compare.html").read_text()
     assert page.count("<img src='data:image/jpeg;base64,") == 4 * 2
     assert not re.findall(r"(?:src|href)=['\"](?!data:)", page)
-    points = values["methods"]["loransac"]["num_points"]
-    assert f">{points:,}</td>" in page
-    assert f" {points} |" in render_table(stored) and "AUC@5" in render_table(stored)
+    assert "Median (worst) of 3 seeds" in page and "Seed 0 in detail" in page
+    table = render_table(stored)
+    header, _, *rows = table.splitlines()
+    assert header == "| method | photos | points | explained % | predicted | AUC@5 | verdicts |"
+    assert "Median (worst) of 3 seeds from 0 on, 4 photos." in table
+    for method, row in zip(values["methods"].values(), rows, strict=False):
+        median, worst = method["median"], method["worst"]
+        assert f"| {median['num_points']} ({worst['num_points']}) |" in row
+        assert f"| {median['auc']['5']:.1f} ({worst['auc']['5']:.1f}) |" in row
+        assert f"{median['num_points']:,}\N{NO-BREAK SPACE}({worst['num_points']:,})</td>" in page
+        assert all(f">{seed['num_predicted_matches']:,}</td>" in page for seed in method["seeds"])
+        assert len(row) <= 100
 
 
-def test_second_run_keeps_finished_work(compared: tuple[Path, dict]):
+def test_second_run_maps_nothing(compared: tuple[Path, dict], monkeypatch: pytest.MonkeyPatch):
     folder, values = compared
-    model = folder / "out" / "ratio" / "sparse" / "0" / "images.bin"
-    before = model.stat().st_mtime_ns
+    monkeypatch.setattr(reconstruction_stage, "map_database", lambda *_, **__: pytest.fail("mapped again"))
     again = compare_methods(
-        folder / "images", folder / "out", ["ratio"], CONFIG, ground_truth=folder / "truth"
+        folder / "images", folder / "out", METHODS, CONFIG, num_seeds=3, ground_truth=folder / "truth"
     )
-    assert model.stat().st_mtime_ns == before
-    assert again["methods"]["ratio"] == values["methods"]["ratio"]
+    assert again["methods"] == values["methods"]
+
+
+def test_one_seed_is_one_model(compared: tuple[Path, dict]):
+    folder, values = compared
+    single = compare_methods(
+        folder / "images", folder / "out", ["ratio"], CONFIG, num_seeds=1, ground_truth=folder / "truth"
+    )
+    method = single["methods"]["ratio"]
+    assert method["seeds"] == values["methods"]["ratio"]["seeds"][:1]
+    assert method["median"] == method["worst"]
+    header, _, row, *_ = render_table({"kind": "compare", **single}).splitlines()
+    assert header.startswith("| method | verified pairs |") and header.endswith("| predicted | verdict |")
+    assert f" {method['num_points']} |" in row
+    page = (folder / "out" / "compare.html").read_text()
+    assert "Median" not in page and ">explained %</th>" in page
+
+
+def test_a_seed_without_a_model_counts_as_nothing_registered(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    images, truth = render_scene(tmp_path)
+    map_database = reconstruction_stage.map_database
+
+    def fail_for_seed_2(*args: object, seed: int, **options: object) -> object:
+        if seed == 2:
+            raise ReconstructionError("no model today")
+        return map_database(*args, seed=seed, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(reconstruction_stage, "map_database", fail_for_seed_2)
+    with caplog.at_level("INFO", logger="corrsfm"):
+        values = compare_methods(images, tmp_path / "out", ["ratio"], CONFIG, num_seeds=3, ground_truth=truth)
+    assert [line for line in caplog.messages if line.startswith("method")] == [
+        f"method ratio, seed {number} of 3" for number in (1, 2, 3)
+    ]
+    method = values["methods"]["ratio"]
+    assert method["failure"] is None
+    failed = method["seeds"][2]
+    assert failed["failure"] == "no model today" and failed["grade"] is None
+    assert failed["ground_truth"]["auc"] == {"1": 0.0, "5": 0.0, "10": 0.0}
+    assert method["worst"] == {
+        "num_registered": 0, "num_points": 0, "explained_share": 0.0, "num_predicted_matches": 0,
+        "auc": {"1": 0.0, "5": 0.0, "10": 0.0},
+    }  # fmt: skip
+    assert method["median"]["num_registered"] >= 3
+    assert ", 1 failed |" in render_table({"kind": "compare", **values})
+    assert "no model today" in (tmp_path / "out" / "compare.html").read_text()
+
+
+def test_photos_without_known_cameras_are_noticed_before_mapping(tmp_path: Path):
+    images, truth = render_scene(tmp_path)
+    for path in images.iterdir():
+        path.rename(path.with_stem(f"other_{path.stem}"))
+    with pytest.raises(InputError, match="share no photo name"):
+        compare_methods(images, tmp_path / "out", ["ratio"], CONFIG, ground_truth=truth)
+    assert not (tmp_path / "out" / "ratio").exists()
+
+
+@pytest.mark.parametrize("num_seeds", [0, -1])
+def test_no_seeds_are_refused(tmp_path: Path, num_seeds: int):
+    with pytest.raises(ConfigError, match=f"{num_seeds} seeds from 0 on: expected a number from 1"):
+        compare_methods(tmp_path, tmp_path / "out", ["ratio"], CONFIG, num_seeds=num_seeds)
+    result = CliRunner().invoke(main, ["compare", str(tmp_path), "--seeds", str(num_seeds)])
+    assert result.exit_code == 2 and f"'--seeds': {num_seeds} is not in the range x>=1" in result.output
 
 
 def test_failed_mapping_is_a_result_with_its_reason(tmp_path: Path):
     write_photos(tmp_path / "wall", 2)
     values = compare_methods(
         tmp_path / "wall", tmp_path / "out", ["ratio"],
-        cfg.PipelineConfig(features=cfg.FeaturesConfig(max_features=60), run=CONFIG.run),
+        cfg.PipelineConfig(features=cfg.FeaturesConfig(max_features=60), run=CONFIG.run), num_seeds=2,
     )  # fmt: skip
     method = values["methods"]["ratio"]
     assert "no model could be made" in method["failure"]
     assert (method["num_registered"], method["num_points"], method["ground_truth"]) == (0, 0, None)
     assert "no model could be made" in (tmp_path / "out" / "compare.html").read_text()
-    assert "0/2" in render_table({"kind": "compare", **values})
+    assert "| ratio | 0 (0) | 0 (0) | 0 (0) | 0 (0) | 2 failed |" in render_table(
+        {"kind": "compare", **values}
+    )
 
 
 def test_changed_features_reach_every_method(tmp_path: Path):
@@ -127,7 +220,7 @@ def test_changed_features_reach_every_method(tmp_path: Path):
         pipeline.extract_features(base, cfg.FeaturesConfig(max_features=num), CONFIG.run)
         pipeline.make_pairs(base, cfg.PairsConfig(), CONFIG.run)
         pipeline.match_pairs(base, cfg.MatchesConfig(), CONFIG.run)
-        share_matches(base, target)
+        share_stages(base, target)
         assert target.require("matches").fingerprint == base.require("matches").fingerprint
         assert os.path.samefile(base.matches, target.matches)
         outcome = pipeline.prune_matches(target, cfg.PruneConfig(method=cfg.PruneMethod.RATIO), CONFIG.run)
