@@ -243,36 +243,43 @@ def _pycolmap_table(values: dict[str, Any]) -> Table:
     return Table(header=header, rows=rows, caption=caption)
 
 
-def _seeds_table(values: dict[str, Any]) -> Table:
-    header = [
-        "scene",
-        "setting",
-        "AUC@5 median",
-        "worst",
-        "registered",
-        "models tried",
-        "verdicts",
-        "seconds",
-    ]
-    rows = []
+def _whole_scenes_table(values: dict[str, Any]) -> Table:
+    """Scenes by columns; of a column's settings the one with the best median, and which that is."""
+    found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in values["rows"]:
-        runs = row["runs"]
-        scores = [run["auc5"] for run in runs]
-        grades = Counter(run["grade"] for run in runs if run["grade"])
-        rows.append(
-            [
-                row["scene"],
-                row["setting"],
-                _number(statistics.median(scores)),
-                _number(min(scores)),
-                f"{min(run['num_registered'] for run in runs)}/{runs[0]['num_photos']}",
-                str(max(run["num_tried"] for run in runs)),
-                ", ".join(f"{num} {grade}" for grade, num in sorted(grades.items())) or "–",
-                _number(statistics.median(run["seconds"] for run in runs)),
-            ]
-        )
-    num_seeds = len(values["rows"][0]["runs"])
-    return Table(header=header, rows=rows, caption=f"{num_seeds} seeds. {_origin(values)}")
+        found.setdefault(row["scene"], {}).setdefault(row["column"], []).append(row)
+    columns = list(dict.fromkeys(row["column"] for row in values["rows"]))
+    settings = {(row["column"], row["setting"]) for row in values["rows"]}
+    is_choice = {column: sum(one == column for one, _ in settings) > 1 for column in columns}
+    num_seeds = max(len(row["runs"]) for row in values["rows"])
+    header = ["scene", "photos"]
+    for column in columns:
+        header += [column, "which"] if is_choice[column] else [column]
+    rows = []
+    for scene, by_column in found.items():
+        cells = [scene, str(next(iter(by_column.values()))[0]["runs"][0]["num_photos"])]
+        for column in columns:
+            choice = by_column.get(column, [])
+            best = max(choice, key=lambda row: _median_score(row["runs"]), default=None)
+            cells.append(_runs_cell(best["runs"], num_seeds) if best else "–")
+            if is_choice[column]:
+                cells.append(f"{best['setting']} (of {len(choice)})" if best else "–")
+        rows.append(cells)
+    caption = f"AUC@5 of {num_seeds} seeds: median (worst). {_origin(values)}"
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _median_score(runs: list[dict[str, Any]]) -> float:
+    return statistics.median(run["auc5"] for run in runs)
+
+
+def _runs_cell(runs: list[dict[str, Any]], num_seeds: int) -> str:
+    """Median and worst score, and the photos and runs if some are missing."""
+    text = f"{_median_score(runs):.1f} ({min(run['auc5'] for run in runs):.1f})"
+    registered, photos = min(run["num_registered"] for run in runs), runs[0]["num_photos"]
+    if registered < photos:
+        text += f", {registered}/{photos}"
+    return text if len(runs) == num_seeds else f"{text}, {len(runs)} of {num_seeds} seeds"
 
 
 def _bench_table(values: dict[str, Any]) -> Table:
@@ -320,7 +327,7 @@ _RENDERERS: dict[str, Callable[[dict[str, Any]], Table]] = {
     "scene": _scene_table,
     "pycolmap": _pycolmap_table,
     "bench": _bench_table,
-    "scene_seeds": _seeds_table,
+    "whole_scenes": _whole_scenes_table,
 }
 
 

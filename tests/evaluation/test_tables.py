@@ -53,17 +53,27 @@ def test_other_results_of_the_project_have_a_table(repository: Path, name: str):
     assert table.count("\n| ") >= len(values["rows"])
 
 
-def test_whole_scenes_over_seeds_show_the_median_the_worst_and_the_verdicts() -> None:
-    runs = [
-        {"seed": seed, "auc5": auc, "num_registered": 9 + seed % 2, "num_photos": 10, "grade": grade,
-         "num_tried": seed + 1, "seconds": 2.0 + seed}
-        for seed, (auc, grade) in enumerate([(80.0, "good"), (60.0, "doubtful"), (90.0, "good")])
-    ]  # fmt: skip
+def test_whole_scenes_show_median_and_worst_of_the_best_setting() -> None:
+    def row(scene: str, column: str, setting: str, scores: list[float], least: int = 10) -> dict[str, object]:
+        runs = [
+            {"seed": seed, "auc5": score, "num_registered": 10 if score else least, "num_photos": 10}
+            for seed, score in enumerate(scores)
+        ]
+        return {"scene": scene, "column": column, "setting": setting, "runs": runs}
+
     values = {
-        "kind": "scene_seeds",
+        "kind": "whole_scenes",
         "provenance": {"versions": {"corrsfm": "0.1.0"}, "seed": 0},
-        "rows": [{"scene": "desk", "setting": "default", "runs": runs}],
+        "rows": [
+            row("desk", "plain", "global", [80.0, 60.0, 90.0]),
+            # A run without a model counts as 0, in the median too.
+            row("desk", "plain", "incremental", [95.0, 0.0, 0.0], least=0),
+            row("desk", "ours", "ours", [90.0, 0.0, 91.0], least=0),
+            row("door", "plain", "incremental", [70.0]),
+        ],
     }
     text = render_table(values)
-    assert "| desk | default | 80.0 | 60.0 | 9/10 | 3 | 1 doubtful, 2 good | 3.0 |" in text
-    assert "3 seeds. corrsfm 0.1.0" in text
+    assert "| scene | photos | plain | which | ours |" in text
+    assert "| desk | 10 | 80.0 (60.0) | global (of 2) | 90.0 (0.0), 0/10 |" in text
+    assert "| door | 10 | 70.0 (70.0), 1 of 3 seeds | incremental (of 1) | – |" in text
+    assert "AUC@5 of 3 seeds: median (worst). corrsfm 0.1.0" in text
