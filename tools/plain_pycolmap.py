@@ -6,9 +6,9 @@
 
 Without --high all options are pycolmap's defaults: up to 8,192 SIFT features, all pairs, SIMPLE_RADIAL
 cameras. With --high they are what COLMAP's automatic reconstruction sets for quality High: affine shapes,
-photos up to 2,400 px, guided matching, and in incremental mapping 30 and 75 iterations of local and global
-bundle adjustment and 3 local refinements. Global mapping comes after `calibrate_view_graph`, as there: focal
-lengths are not known. Everything runs on one thread of the processor.
+photos up to 2,400 px, guided matching, and in incremental mapping 30 and 75 iterations of local and
+global bundle adjustment and 3 local refinements. Global mapping comes after `calibrate_view_graph`, as
+there, because focal lengths are not known. Everything runs on one thread of the processor.
 """
 
 import argparse
