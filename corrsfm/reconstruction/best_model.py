@@ -188,7 +188,9 @@ def select_model(
     """
     models: dict[str, pycolmap.Reconstruction] = {}
 
-    def tried(name: str, model: pycolmap.Reconstruction, seconds: float) -> Tried:
+    def tried(
+        name: str, model: pycolmap.Reconstruction, seconds: float, *, has_more_cameras: bool = False
+    ) -> Tried:
         models[name] = model
         views = views_of(model)
         return Tried(
@@ -196,7 +198,7 @@ def select_model(
             views=views,
             explained=evidence.explain(views),
             seconds=seconds,
-            has_more_cameras=f"-{StartingCameras.SEPARATE}-" in name,
+            has_more_cameras=has_more_cameras,
         )
 
     bank = candidate_bank(seed=seed, on_trial=cameras_on_trial)
@@ -211,7 +213,14 @@ def select_model(
         def map_round(candidates: Sequence[Candidate]) -> list[Tried | None]:
             outcomes = zip(candidates, pool.map(candidates), strict=True)
             return [
-                None if model is None else tried(one.name, model, pool.seconds(one))
+                None
+                if model is None
+                else tried(
+                    one.name,
+                    model,
+                    pool.seconds(one),
+                    has_more_cameras=one.cameras is StartingCameras.SEPARATE,
+                )
                 for one, model in outcomes
             ]
 
@@ -224,15 +233,18 @@ def select_model(
                 seed=seed,
                 refine_principal_point=refine_principal_point,
             )
-            return None if again is None else tried(model.name + _MENDED, again, first_seconds)
+            if again is None:
+                return None
+            name = model.name + _MENDED
+            return tried(name, again, first_seconds, has_more_cameras=model.has_more_cameras)
 
         start = None
         if first is not None:
             start = tried(FIRST, first, first_seconds)
-            slack = _focal_slack(first)
             # Fewer focal lengths may be found where many are open; the other candidates leave them as open.
-            if slack is not None and slack.is_large and cameras_on_trial is StartingCameras.SHARED:
-                start = dataclasses.replace(start, is_open=True)
+            if cameras_on_trial is StartingCameras.SHARED:
+                slack = _focal_slack(first)
+                start = dataclasses.replace(start, is_open=slack is not None and slack.is_large)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
             start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)

@@ -13,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 __all__ = [
+    "adjust",
     "describe_impossible",
     "focal_length_ratios",
     "has_possible_cameras",
@@ -107,15 +108,24 @@ def refine_intrinsics(
         0 for all cores.
     """
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     options.refine_principal_point = refine_principal_point
     options.ceres.solver_options.num_threads = num_threads or -1
-    # `pycolmap.bundle_adjustment` does the same but logs to the terminal.
+    for _ in range(_REFINEMENTS):
+        adjust(model, options)
+        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG)
+    model.update_point_3d_errors()
+
+
+def adjust(
+    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+) -> pycolmap.BundleAdjustmentSummary:
+    """Adjust a whole model in place, without the summary in the terminal.
+
+    `pycolmap.bundle_adjustment` does the same but logs to the terminal.
+    """
+    options.print_summary = False
     problem = pycolmap.BundleAdjustmentConfig()
     for image_id in model.reg_image_ids():
         problem.add_image(image_id)
     problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    for _ in range(_REFINEMENTS):
-        pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
-        pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG)
-    model.update_point_3d_errors()
+    return pycolmap.create_default_bundle_adjuster(options, problem, model).solve()

@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
+from corrsfm.reconstruction.calibration import adjust
 from corrsfm.reconstruction.views import views_of
 
 __all__ = ["FocalSlack", "measure_focal_slack"]
@@ -71,7 +72,7 @@ def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
     if model.num_reg_images() < 3 or model.num_points3D() < _MIN_NUM_POINTS:
         return None
     base = _thinned(model)
-    cost = _adjust(base, refine_focal_length=True)
+    cost = _cost_of(base, refine_focal_length=True)
     if cost is None or cost <= 0:
         return None
     views = views_of(base)
@@ -82,7 +83,7 @@ def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
             params = camera.params.copy()
             params[list(camera.focal_length_idxs())] *= factor
             camera.params = params
-        other_cost = _adjust(other, refine_focal_length=False)
+        other_cost = _cost_of(other, refine_focal_length=False)
         if other_cost is None:
             continue
         # Near the best focal length, costs rise with the square of the change and poses change in proportion.
@@ -102,19 +103,13 @@ def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return copy
 
 
-def _adjust(model: pycolmap.Reconstruction, *, refine_focal_length: bool) -> float | None:
-    """Adjust a model in place; its cost, None if there is nothing to adjust."""
+def _cost_of(model: pycolmap.Reconstruction, *, refine_focal_length: bool) -> float | None:
+    """The cost of a model after adjusting it in place, None if there is nothing to adjust."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
     options.refine_focal_length = refine_focal_length
     options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = _MAX_ITERATIONS
-    problem = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        problem.add_image(image_id)
-    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, problem, model)
-    summary = adjuster.solve()
+    summary = adjust(model, options)
     if not summary.is_solution_usable():
         return None
     # The type stubs know the base class of summaries only.
