@@ -19,8 +19,8 @@ from corrsfm.reconstruction.views import views_of
 
 __all__ = ["FocalSlack", "measure_focal_slack"]
 
-# Right models of training and validation scenes have 1.07 and 0.77° at most, but for one.
-_LARGEST_FACTOR, _LARGEST_POSE_CHANGE_DEG = 1.08, 0.85
+# Right models of training, validation and sample scenes have 1.07 and 1.1° at most, but for one.
+_LARGEST_FACTOR, _LARGEST_POSE_CHANGE_DEG = 1.08, 1.2
 
 _FACTOR = 1.18
 # A rise of the squared reprojection errors that the lens model alone may account for; and the smallest one
