@@ -8,6 +8,7 @@ from corrsfm.config.stages import (
     FeaturesConfig,
     ImagesConfig,
     Mapper,
+    Matcher,
     MatchesConfig,
     OperatingPoint,
     PairsConfig,
@@ -20,17 +21,19 @@ from corrsfm.config.stages import (
     RunConfig,
     load_pipeline,
 )
-from corrsfm.config.usage import MatchInput, NetworkUsage
+from corrsfm.config.usage import FeatureKind, MatchInput, NetworkUsage
 
 __all__ = [
     "LARGEST_INT",
     "CameraMode",
     "DatabaseConfig",
     "Extractor",
+    "FeatureKind",
     "FeaturesConfig",
     "ImagesConfig",
     "Mapper",
     "MatchInput",
+    "Matcher",
     "MatchesConfig",
     "NetworkUsage",
     "OperatingPoint",

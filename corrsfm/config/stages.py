@@ -12,6 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from corrsfm.config.fields import LARGEST_INT, from_dict, load_toml, option
+from corrsfm.config.usage import FeatureKind
 
 __all__ = [
     "CameraMode",
@@ -20,6 +21,7 @@ __all__ = [
     "FeaturesConfig",
     "ImagesConfig",
     "Mapper",
+    "Matcher",
     "MatchesConfig",
     "OperatingPoint",
     "PairStrategy",
@@ -44,10 +46,26 @@ class CameraMode(StrEnum):
 
 
 class Extractor(StrEnum):
-    """Implementations of SIFT."""
+    """What finds and describes keypoints: two implementations of SIFT, and networks."""
 
     OPENCV = "opencv"
     PYCOLMAP = "pycolmap"
+    ALIKED = "aliked"
+    DISK = "disk"
+    SUPERPOINT = "superpoint"
+
+    @property
+    def kind(self) -> FeatureKind:
+        """What its features are."""
+        sift = self in (Extractor.OPENCV, Extractor.PYCOLMAP)
+        return FeatureKind.SIFT if sift else FeatureKind(self.value)
+
+
+class Matcher(StrEnum):
+    """Ways to find putative matches."""
+
+    NEAREST = "nearest"
+    LIGHTGLUE = "lightglue"
 
 
 class PairStrategy(StrEnum):
@@ -114,16 +132,31 @@ class ImagesConfig:
     camera_params: str = option("", "Known intrinsics as comma-separated numbers in COLMAP's order")
 
 
+_SIFT = ("extractor", (Extractor.OPENCV, Extractor.PYCOLMAP))
+_SUPERPOINT = ("extractor", (Extractor.SUPERPOINT,))
+
+
 @dataclass(frozen=True, kw_only=True)
 class FeaturesConfig:
-    """SIFT extraction."""
+    """Keypoints and descriptors."""
 
-    extractor: Extractor = option(Extractor.OPENCV, "Which SIFT")
+    extractor: Extractor = option(
+        Extractor.OPENCV,
+        "SIFT by OpenCV or pycolmap, or a network: aliked and disk need the extra learned-features, superpoint "
+        "weights of yours",
+    )
     max_features: int = option(4096, "Keypoints kept per photo, strongest first", minimum=1)
     max_image_size: int = option(
         1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
     )
-    root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
+    root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)", used_with=_SIFT)
+    # The checksum of the file is part of what decides about equal features, not its path.
+    superpoint_weights: Path | None = option(
+        None,
+        "SuperPoint's published state dict, such as superpoint_v1.pth",
+        affects_result=False,
+        used_with=_SUPERPOINT,
+    )
 
 
 _SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
@@ -164,8 +197,13 @@ class PairsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchesConfig:
-    """Nearest-neighbour matching of descriptors."""
+    """Putative matches."""
 
+    matcher: Matcher = option(
+        Matcher.NEAREST,
+        "Nearest neighbours of descriptors, or LightGlue, which needs the extra learned-features and features "
+        "of aliked or disk",
+    )
     block_size: int = option(
         4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
     )

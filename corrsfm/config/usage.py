@@ -7,7 +7,17 @@ from enum import StrEnum
 
 from corrsfm.config.fields import option
 
-__all__ = ["MatchInput", "NetworkUsage"]
+__all__ = ["FeatureKind", "MatchInput", "NetworkUsage"]
+
+
+class FeatureKind(StrEnum):
+    """What keypoints and descriptors are, whoever made them."""
+
+    SIFT = "sift"
+    ALIKED = "aliked"
+    DISK = "disk"
+    SUPERPOINT = "superpoint"
+    OTHER = "other"
 
 
 class MatchInput(StrEnum):
@@ -24,6 +34,9 @@ class NetworkUsage:
     The defaults are those of the first bundled checkpoint, and of every file that says nothing.
     """
 
+    features: FeatureKind = option(
+        FeatureKind.SIFT, "Features whose matches the network was trained on", affects_result=False
+    )
     input: MatchInput = option(
         MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
     )

@@ -13,9 +13,9 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError
-from corrsfm.features.sift import algorithm_of, create_extractor
-from corrsfm.images.photos import read_image, read_mask
-from corrsfm.machine import count_threads, threaded
+from corrsfm.features import algorithm_of, create_extractor, reads_colour
+from corrsfm.images.photos import read_colour, read_image, read_mask
+from corrsfm.machine import count_threads, find_device, threaded
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
@@ -42,7 +42,7 @@ def extract_features(
     """
     index = read_index(workspace)
     images = workspace.require("images")
-    algorithm = algorithm_of(config.extractor)
+    algorithm = algorithm_of(config)
     wanted = {
         record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
         for record in index.records
@@ -50,14 +50,16 @@ def extract_features(
     of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
     store = ItemStore(workspace.features, FEATURES)
     records = {record.name: record for record in index.records}
-    extract = create_extractor(config)
+    device = find_device(run.device) if config.extractor.kind != cfg.FeatureKind.SIFT else "cpu"
+    extract = create_extractor(config, device)
+    read = read_colour if reads_colour(config.extractor) else read_image
     mask_dir = images.config.get("mask_dir")
     unreadable: list[str] = []
 
     def work(name: str) -> Features | ImageError:
         record = records[name]
         try:
-            image = read_image(workspace.images_dir / name)
+            image = read(workspace.images_dir / name)
             mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
             return extract(image, mask)
         except ImageError as error:
@@ -102,8 +104,8 @@ def extract_features(
 def _no_features(index: Index, record: ImageRecord) -> Features:
     """Empty features for a photo that was left out."""
     camera = index.camera_of(record)
-    none = np.zeros(0, np.float32)
     return Features(
-        keypoints=np.zeros((0, 2), np.float32), scales=none, orientations=none, scores=none,
-        descriptors=np.zeros((0, 128), np.uint8), image_size=(camera.width, camera.height),
+        keypoints=np.zeros((0, 2), np.float32), scales=None, orientations=None,
+        scores=np.zeros(0, np.float32), descriptors=np.zeros((0, 128), np.uint8),
+        image_size=(camera.width, camera.height),
     )  # fmt: skip
