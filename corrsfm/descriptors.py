@@ -2,8 +2,9 @@
 
 SIFT's are bytes already. Descriptors of learned features are unit vectors of floats, whose products depend in
 the last bits on the order of summation, and with them nearest neighbours that almost tie. In steps of 1/2048
-every partial sum of a product of two unit vectors, of any length, stays below 2²⁴, which float32 holds exactly.
-A step is that of half-precision numbers near one, as hloc stores them, and moves a distance by 0.003 at most.
+every partial sum of a product of two unit vectors, of any length, stays below 2²⁴, which float32 holds
+exactly. A step is that of half-precision numbers near one, as hloc stores them; rounding to it moves the
+distance between two descriptors of 128 numbers by 0.002 on average.
 """
 
 from __future__ import annotations

@@ -136,8 +136,8 @@ class Matches:
     indices : (M, 2) int32
         Keypoint indices in image 0 and image 1; column 0 strictly increases.
     ratios : (M,) float32
-        Distance to the nearest over distance to the second nearest descriptor, in [0, 1]; NaN where ``scores``
-        stand in their place.
+        Distance to the nearest over distance to the second nearest descriptor, in [0, 1]; NaN where
+        ``scores`` stand in their place.
     mutual : (M,) bool
         True where the match is also the nearest neighbour from image 1 to image 0.
     scores : (M,) float32 or None

@@ -72,13 +72,13 @@ def extract(
 ) -> None:
     """Index photos, extract features, match.
 
-    Lists the photos and their cameras, extracts SIFT features, chooses pairs and finds the nearest neighbour
-    of every keypoint, with its distance ratio and a mutual flag.
+    Lists the photos and their cameras, extracts SIFT features or those of a network, chooses pairs and finds
+    the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm import pipeline
     from corrsfm.workspace import Workspace
 
-    pipeline.check_options(run)
+    pipeline.check_options(run, features, matches, workspace_dir=workspace_dir)
     workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
     with workspace.lock():
         outcomes = [

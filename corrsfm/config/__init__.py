@@ -7,6 +7,7 @@ from corrsfm.config.stages import (
     Extractor,
     FeaturesConfig,
     ImagesConfig,
+    ImportedConfig,
     Mapper,
     Matcher,
     MatchesConfig,
@@ -21,18 +22,29 @@ from corrsfm.config.stages import (
     RunConfig,
     load_pipeline,
 )
-from corrsfm.config.usage import FeatureKind, MatchInput, NetworkUsage
+from corrsfm.config.usage import (
+    LIGHTGLUE_KINDS,
+    SIFT_TRAITS,
+    FeatureKind,
+    MatchInput,
+    MatchTraits,
+    NetworkUsage,
+)
 
 __all__ = [
     "LARGEST_INT",
+    "LIGHTGLUE_KINDS",
+    "SIFT_TRAITS",
     "CameraMode",
     "DatabaseConfig",
     "Extractor",
     "FeatureKind",
     "FeaturesConfig",
     "ImagesConfig",
+    "ImportedConfig",
     "Mapper",
     "MatchInput",
+    "MatchTraits",
     "Matcher",
     "MatchesConfig",
     "NetworkUsage",

@@ -20,6 +20,7 @@ __all__ = [
     "Extractor",
     "FeaturesConfig",
     "ImagesConfig",
+    "ImportedConfig",
     "Mapper",
     "Matcher",
     "MatchesConfig",
@@ -142,8 +143,8 @@ class FeaturesConfig:
 
     extractor: Extractor = option(
         Extractor.OPENCV,
-        "SIFT by OpenCV or pycolmap, or a network: aliked and disk need the extra learned-features, superpoint "
-        "weights of yours",
+        "SIFT by OpenCV or pycolmap, or a network: aliked and disk need the extra learned-features, "
+        "superpoint weights of yours",
     )
     max_features: int = option(4096, "Keypoints kept per photo, strongest first", minimum=1)
     max_image_size: int = option(
@@ -157,6 +158,15 @@ class FeaturesConfig:
         affects_result=False,
         used_with=_SUPERPOINT,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedConfig:
+    """Features or matches of another tool, in place of the options of the stage that makes them."""
+
+    source: str = option("", "File that they came from")
+    kind: FeatureKind = option(FeatureKind.OTHER, "What the features are")
+    has_shapes: bool = option(False, "Whether keypoints came with scale and orientation")
 
 
 _SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
@@ -201,8 +211,8 @@ class MatchesConfig:
 
     matcher: Matcher = option(
         Matcher.NEAREST,
-        "Nearest neighbours of descriptors, or LightGlue, which needs the extra learned-features and features "
-        "of aliked or disk",
+        "Nearest neighbours of descriptors, or LightGlue, which needs the extra learned-features and the "
+        "features of aliked or disk",
     )
     block_size: int = option(
         4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
@@ -223,7 +233,9 @@ class PruneConfig:
         PruneMethod.CORRADAPTOR,
         "How putative matches are pruned; all but corradaptor and cascade need no network",
     )
-    model: Path | None = option(None, "Network checkpoint; the bundled one if not given", used_with=_NETWORK)
+    model: Path | None = option(
+        None, "Network checkpoint; if not given the bundled one for the features", used_with=_NETWORK
+    )
     operating_point: OperatingPoint = option(
         OperatingPoint.SFM,
         "sfm keeps what mapping can use; pose is strict, for two-view poses",

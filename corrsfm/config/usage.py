@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from corrsfm.config.fields import option
 
-__all__ = ["FeatureKind", "MatchInput", "NetworkUsage"]
+__all__ = ["LIGHTGLUE_KINDS", "SIFT_TRAITS", "FeatureKind", "MatchInput", "MatchTraits", "NetworkUsage"]
 
 
 class FeatureKind(StrEnum):
@@ -18,6 +18,33 @@ class FeatureKind(StrEnum):
     DISK = "disk"
     SUPERPOINT = "superpoint"
     OTHER = "other"
+
+
+LIGHTGLUE_KINDS = (FeatureKind.ALIKED, FeatureKind.DISK)
+"""Features that LightGlue's package has weights for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchTraits:
+    """What the putative matches of a scene carry.
+
+    Attributes
+    ----------
+    features : FeatureKind
+        What they match.
+    has_shapes : bool
+        Whether keypoints have scale and orientation.
+    has_ratios : bool
+        Whether matches have the ratio of the two nearest descriptor distances.
+    """
+
+    features: FeatureKind = FeatureKind.SIFT
+    has_shapes: bool = True
+    has_ratios: bool = True
+
+
+SIFT_TRAITS = MatchTraits()
+"""Those of our own features and nearest neighbours."""
 
 
 class MatchInput(StrEnum):

@@ -149,7 +149,9 @@ def _write_features(
 ) -> None:
     if not np.isfinite(features.keypoints).all():
         raise InputError(f"{name}: a keypoint is not a finite number; extract its features again")
-    keypoints = np.column_stack([features.keypoints, features.scales, features.orientations])
+    keypoints = features.keypoints
+    if features.scales is not None and features.orientations is not None:
+        keypoints = np.column_stack([keypoints, features.scales, features.orientations])
     database.write_keypoints(image_id, np.ascontiguousarray(keypoints, np.float32))
     if write_descriptors:
         database.write_descriptors(

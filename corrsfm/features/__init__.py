@@ -31,8 +31,8 @@ def algorithm_of(config: FeaturesConfig) -> str:
 
     Raises
     ------
-    ConfigError, CheckpointError
-        If a network is missing.
+    DependencyError, ConfigError, CheckpointError
+        If a network or its weights are missing.
     """
     if config.extractor.kind == FeatureKind.SIFT:
         from corrsfm.features import sift
@@ -56,8 +56,8 @@ def create_extractor(
 
     Raises
     ------
-    ConfigError, CheckpointError
-        If a network is missing.
+    DependencyError, ConfigError, CheckpointError
+        If a network or its weights are missing.
     """
     if config.extractor.kind == FeatureKind.SIFT:
         from corrsfm.features import sift

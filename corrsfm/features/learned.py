@@ -44,8 +44,8 @@ def algorithm_of(config: FeaturesConfig) -> str:
 
     Raises
     ------
-    ConfigError, CheckpointError
-        As `create_extractor`.
+    ConfigError
+        If SuperPoint's weights are not given.
     """
     if config.extractor == Extractor.SUPERPOINT:
         weights = sha256_of(_superpoint_weights(config))
@@ -63,8 +63,10 @@ def create_extractor(
 
     Raises
     ------
+    DependencyError
+        If the networks are not installed.
     ConfigError
-        If the networks are not installed, or SuperPoint's weights are not given.
+        If SuperPoint's weights are not given.
     CheckpointError
         If SuperPoint's weights are missing or of another network.
     """

@@ -15,10 +15,11 @@ from corrsfm.config import config_hash
 from corrsfm.errors import ImageError
 from corrsfm.features import algorithm_of, create_extractor, reads_colour
 from corrsfm.images.photos import read_colour, read_image, read_mask
-from corrsfm.machine import count_threads, find_device, threaded
+from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.imported import imported_features, imported_from, refuse_foreign
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
 from corrsfm.workspace.store import ItemStore
@@ -39,16 +40,31 @@ def extract_features(
     ------
     ImageError
         Naming every photo that cannot be read; the features of the others are kept.
+    WorkspaceError
+        If the features were imported and a photo has none.
     """
     index = read_index(workspace)
     images = workspace.require("images")
+    store = ItemStore(workspace.features, FEATURES)
+    refuse_foreign(workspace.features, FEATURES)
+    if (source := imported_from(workspace, "features")) is not None:
+        return complete(
+            workspace,
+            "features",
+            store,
+            imported_features(workspace),
+            lambda missing: [],
+            source,
+            inputs={"images": images.fingerprint},
+            overwrite=False,
+            unit="photo",
+        )
     algorithm = algorithm_of(config)
     wanted = {
         record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
         for record in index.records
     }
     of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
-    store = ItemStore(workspace.features, FEATURES)
     records = {record.name: record for record in index.records}
     device = find_device(run.device) if config.extractor.kind != cfg.FeatureKind.SIFT else "cpu"
     extract = create_extractor(config, device)
@@ -65,8 +81,13 @@ def extract_features(
         except ImageError as error:
             return error
 
+    # On a CPU each photo takes one thread, on a GPU one photo goes at a time.
+    num_at_once = count_threads(run.threads) if device == "cpu" else 1
+    if config.extractor.kind != cfg.FeatureKind.SIFT:
+        use_threads(1)
+
     def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
-        for name, result in threaded(work, missing, count_threads(run.threads)):
+        for name, result in threaded(work, missing, num_at_once):
             if isinstance(result, Features):
                 yield name, result
             elif images.config.get("skip_unreadable"):

@@ -15,7 +15,7 @@ translations        (I, 3) float64      cam_from_world
 keypoint_offsets    (I+1,) int64        rows of each photo in the next four
 keypoints           (K, 2) uint16       pixels (COLMAP convention) in units of the longest side / 65535
 corrections         (K, 2) float16      undistorted minus pinhole normalised coordinates
-log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels; NaN if it has none
+log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels; NaN for none
 orientations        (K,) uint16         orientation in units of a turn / 65536; without meaning where
                                         log_scales is NaN
 pairs               (P, 2) uint16       photo indices

