@@ -18,6 +18,7 @@ from corrsfm.geometry import wrap_angles
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
 __all__ = [
+    "NEUTRAL_CHANNELS",
     "SIDE_CHANNELS",
     "SIDE_LAYOUTS",
     "confidence",
@@ -206,6 +207,9 @@ SIDE_CHANNELS = {
     "sin": SideChannel(source="rotations", function="sin"),
 }
 """The side channels of a network's input by name, in order."""
+
+NEUTRAL_CHANNELS = (0.8, 1.0, 0.0, 1.0, 0.0)
+"""Value of each side channel that says least."""
 
 SIDE_LAYOUTS = (0, 2, 5)
 """How many of them, counted from the first, a network may be made for: all, those of descriptors, none."""

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from corrsfm.config import Extractor, MatchInput, from_dict, option
+from corrsfm.config import Extractor, FeatureKind, MatchInput, from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
 from corrsfm.geometry import INLIER_THRESHOLD
@@ -95,6 +95,7 @@ class TrainConfig:
     val_file: Path | None = option(None, "Compact file of the validation scenes")
     output: Path = option(Path("training"), "Folder of the run: log, checkpoints")
     initial: str = option("", "Checkpoint, or name of a bundled one, whose weights the run starts from")
+    features: FeatureKind = option(FeatureKind.SIFT, "Features that the pairs are of, noted in the weights")
     input: MatchInput = option(
         MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
     )

@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from corrsfm.config import MatchInput, from_dict, to_dict
 from corrsfm.errors import ConfigError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
-from corrsfm.prune.correspondences import SIDE_LAYOUTS
-from corrsfm.training.checkpoint import Average, load_state, save_state
+from corrsfm.prune.correspondences import NEUTRAL_CHANNELS, SIDE_LAYOUTS
+from corrsfm.training.checkpoint import Average, load_state, save_state, without_side_channels
 from corrsfm.training.config import TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
 from corrsfm.training.journal import Journal, described_recipe, hardware
@@ -112,7 +112,8 @@ def network_config(recipe: TrainRecipe) -> NetworkConfig:
 def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     """Build the network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
 
-    It reads what the recipe says; an initial checkpoint may have read another kind of matches.
+    It reads what the recipe says; an initial checkpoint may have read another kind of matches, and more side
+    channels.
 
     Raises
     ------
@@ -125,16 +126,19 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
     config = network_config(recipe)
     if not recipe.train.initial:
         network = CorrAdaptor.from_config(config)
-        network.usage = replace(network.usage, input=recipe.train.input)
+        network.usage = replace(network.usage, input=recipe.train.input, features=recipe.train.features)
         return network
     network = load_network(recipe.train.initial, architecture="corradaptor")
     assert network.config is not None
+    if recipe.network and config == replace(network.config, side_channels=config.side_channels):
+        if config.side_channels < network.side_channels:
+            network = without_side_channels(network, config.side_channels, NEUTRAL_CHANNELS)
     if recipe.network and network.config != config:
         raise ConfigError(
             f"network: differs from that of the initial checkpoint {recipe.train.initial}, which is "
             f"{to_dict(network.config)}; leave the table out to continue with that network"
         )
-    network.usage = replace(network.usage, input=recipe.train.input)
+    network.usage = replace(network.usage, input=recipe.train.input, features=recipe.train.features)
     return network
 
 
