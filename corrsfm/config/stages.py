@@ -82,7 +82,7 @@ class PairStrategy(StrEnum):
 
 
 class PruneMethod(StrEnum):
-    """Ways to prune putative matches."""
+    """Ways to prune putative matches: none, classical ones, and networks."""
 
     NONE = "none"
     RATIO = "ratio"
@@ -90,6 +90,23 @@ class PruneMethod(StrEnum):
     MAGSAC = "magsac"
     CORRADAPTOR = "corradaptor"
     CASCADE = "cascade"
+    POINTCN = "pointcn"
+    OANET = "oanet"
+    LMCNET = "lmcnet"
+    MS2DGNET = "ms2dgnet"
+    CLNET = "clnet"
+    PGFNET = "pgfnet"
+    CONVMATCH = "convmatch"
+    NCMNET = "ncmnet"
+    MGNET = "mgnet"
+    UMATCH = "umatch"
+
+    @property
+    def architecture(self) -> str | None:
+        """The network that it asks, as `corrsfm.model.load_network` calls it; None if it asks none."""
+        if self in (PruneMethod.NONE, PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC):
+            return None
+        return str(PruneMethod.CORRADAPTOR if self is PruneMethod.CASCADE else self)
 
 
 class OperatingPoint(StrEnum):
@@ -219,7 +236,7 @@ class MatchesConfig:
     )
 
 
-_NETWORK = ("method", (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE))
+_NETWORK = ("method", tuple(method for method in PruneMethod if method.architecture))
 _ESTIMATOR = ("method", (PruneMethod.LORANSAC, PruneMethod.MAGSAC))
 _RATIO = ("method", (PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC, PruneMethod.CASCADE))
 
@@ -231,7 +248,8 @@ class PruneConfig:
     # The best on the validation scenes, see results/pose_val_scenes.json.
     method: PruneMethod = option(
         PruneMethod.CORRADAPTOR,
-        "How putative matches are pruned; all but corradaptor and cascade need no network",
+        "How putative matches are pruned: none to magsac without a network, corradaptor and cascade with the "
+        "bundled one, all others with a network of yours (--model)",
     )
     model: Path | None = option(
         None, "Network checkpoint; if not given the bundled one for the features", used_with=_NETWORK

@@ -9,7 +9,7 @@
     ├── robust.py            LO-RANSAC, MAGSAC++ and the errors to a model
     ├── classical.py         none, ratio, loransac, magsac
     ├── selection.py         what the network sees, and what is kept of it
-    ├── learned.py           corradaptor: owns device, batches and memory
+    ├── learned.py           networks: owns device, batches and memory
     └── cascade.py           the ratio test where it is enough, the network elsewhere
 
 Modules of this folder import each other downwards in the order robust < classical < selection <
@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from corrsfm.config import SIFT_TRAITS, FeatureKind, MatchTraits, PruneConfig, PruneMethod
@@ -112,7 +113,8 @@ def build_pruner(
     CheckpointError
         If a network is needed and its checkpoint cannot be used, or reads what the matches lack.
     ConfigError
-        If the method needs the ratios of descriptor distances and the matches have none.
+        If the method needs the ratios of descriptor distances and the matches have none; if it needs weights
+        that do not come with the package.
     """
     from corrsfm.prune.classical import EstimatorPruner, KeepAll, RatioPruner
 
@@ -126,12 +128,12 @@ def build_pruner(
         return KeepAll()
     if config.method is PruneMethod.RATIO:
         return RatioPruner(config.max_ratio)
-    if config.method is PruneMethod.CORRADAPTOR:
-        return _load_network_pruner(config, traits, device, threads)
-    if config.method is PruneMethod.CASCADE:
+    if config.method.architecture is not None:
+        network = _load_network_pruner(config, traits, device, threads)
+        if config.method is not PruneMethod.CASCADE:
+            return network
         from corrsfm.prune.cascade import CascadePruner
 
-        network = _load_network_pruner(config, traits, device, threads)
         return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=config.max_ratio)
     return EstimatorPruner(
         str(config.method),
@@ -154,12 +156,28 @@ def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.S
     ------
     CheckpointError
         If there is no such checkpoint.
+    ConfigError
+        If no weights of its network come with the package, and the config names none.
     """
-    if config.method not in (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE):
+    if config.method.architecture is None:
         return None
     from corrsfm.model import weights
 
-    return weights.checkpoint_sha256(config.model or weights.default_checkpoint(features))
+    return weights.checkpoint_sha256(_checkpoint(config, features))
+
+
+def _checkpoint(config: PruneConfig, features: FeatureKind) -> Path | str:
+    """The checkpoint that a config's method uses: its own, or the bundled one for features of a kind."""
+    from corrsfm.model import weights
+
+    if config.model is not None:
+        return config.model
+    if config.method.architecture != PruneMethod.CORRADAPTOR:
+        raise ConfigError(
+            f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint with "
+            "--model FILE, published or trained with `corrsfm train`"
+        )
+    return weights.default_checkpoint(features)
 
 
 def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, threads: int) -> Pruner:
@@ -167,9 +185,11 @@ def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, 
     from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    name = config.model or weights.default_checkpoint(traits.features)
+    name = _checkpoint(config, traits.features)
+    assert config.method.architecture is not None
     pruner = Pruner.load(
         name,
+        config.method.architecture,
         device=device,
         operating_point=config.operating_point,
         max_candidates=config.max_candidates,
@@ -184,7 +204,8 @@ def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, 
         advice = _WITHOUT_RATIOS
         if traits.has_ratios:
             fits = weights.default_checkpoint(traits.features)
-            advice = (f"try --model {fits}, or " if fits != name else "try ") + "--method loransac"
+            has_other = config.method.architecture == PruneMethod.CORRADAPTOR and fits != name
+            advice = (f"try --model {fits}, or " if has_other else "try ") + "--method loransac"
         raise CheckpointError(
             f"{name}: this network reads {missing}, which {traits.features} features and their matches here "
             f"lack; {advice}"

@@ -83,7 +83,7 @@ def prune_matches(
 
 
 def _num_pruned_together(method: cfg.PruneMethod, device: str, threads: int) -> int:
-    with_network = method in (cfg.PruneMethod.CORRADAPTOR, cfg.PruneMethod.CASCADE)
+    with_network = method.architecture is not None
     on_cpu = device == "cpu"
     return (
         PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD * threads if with_network and on_cpu else PAIRS_PRUNED_TOGETHER

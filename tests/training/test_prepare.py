@@ -14,7 +14,7 @@ from corrsfm.labelled.oanet import read_pairs
 from corrsfm.model import CorrAdaptor, NetworkConfig
 from corrsfm.training.config import NO_AUGMENTATION, PrepareConfig, load_recipe
 from corrsfm.training.dataset import RealPairs, generator_for
-from corrsfm.training.loop import network_config
+from corrsfm.training.initial import network_config
 from corrsfm.training.prepare import (
     choose_pairs,
     prepare_file,
