@@ -130,9 +130,9 @@ def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
         return network
     network = load_network(recipe.train.initial, architecture="corradaptor")
     assert network.config is not None
-    if recipe.network and config == replace(network.config, side_channels=config.side_channels):
-        if config.side_channels < network.side_channels:
-            network = without_side_channels(network, config.side_channels, NEUTRAL_CHANNELS)
+    fewer = recipe.network and config.side_channels < network.side_channels
+    if fewer and config == replace(network.config, side_channels=config.side_channels):
+        network = without_side_channels(network, config.side_channels, NEUTRAL_CHANNELS)
     if recipe.network and network.config != config:
         raise ConfigError(
             f"network: differs from that of the initial checkpoint {recipe.train.initial}, which is "

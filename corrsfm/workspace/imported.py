@@ -13,10 +13,10 @@ import h5py
 
 from corrsfm import config as cfg
 from corrsfm.errors import ConfigError, WorkspaceError, first_few
-from corrsfm.types import Pair
-from corrsfm.workspace.folder import Workspace
+from corrsfm.types import Pair, PairList
+from corrsfm.workspace.folder import StageRecord, Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES, Kind
-from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
 from corrsfm.workspace.store import ItemStore
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "imported_features",
     "imported_from",
     "imported_matches",
+    "record_imported_pairs",
     "refuse_foreign",
     "refuse_foreign_files",
     "traits_of",
@@ -75,6 +76,21 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
 def imported_matches(workspace: Workspace) -> dict[Pair, str]:
     """Fingerprints of imported matches, which are what they are."""
     return ItemStore(workspace.matches, MATCHES).fingerprints(read_pairs(workspace).pairs)
+
+
+def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg.ImportedConfig) -> None:
+    """Write the pairs of imported matches and record them as made by the import."""
+    features = workspace.require("features").fingerprint
+    write_pairs(workspace, pair_list)
+    workspace.finish(
+        "pairs",
+        StageRecord(
+            fingerprint=cfg.config_hash("imported pairs", pair_list.pairs, features),
+            config=cfg.to_dict(source),
+            inputs={"features": features},
+            num_items=len(pair_list),
+        ),
+    )
 
 
 def traits_of(workspace: Workspace) -> cfg.MatchTraits:
