@@ -164,7 +164,9 @@ class FeaturesConfig:
 class ImportedConfig:
     """Features or matches of another tool, in place of the options of the stage that makes them."""
 
-    source: str = option("", "File that they came from")
+    features: Path | None = option(None, "File of hloc that the features came from")
+    matches: Path | None = option(None, "File of hloc that the matches came from")
+    database: Path | None = option(None, "COLMAP database that both came from")
     kind: FeatureKind = option(FeatureKind.OTHER, "What the features are")
     has_shapes: bool = option(False, "Whether keypoints came with scale and orientation")
 

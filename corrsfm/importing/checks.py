@@ -1,4 +1,4 @@
-"""Arrays of another tool → features and matches, or an error that names the file, the photo and the number."""
+"""Arrays of another tool → features and matches, or an error that names the file, the photo and the row."""
 
 from __future__ import annotations
 
@@ -117,18 +117,16 @@ def matches_from(
                 f"{('first', 'second')[side]} photo, which has {num}; the matches belong to other features"
             )
     order = np.argsort(indices[:, 0], kind="stable")
-    indices = indices[order].astype(np.int32)
-    repeated = indices[1:, 0][np.diff(indices[:, 0]) == 0]
+    ordered = indices[order].astype(np.int32)
+    repeated = ordered[1:, 0][np.diff(ordered[:, 0]) == 0]
     if len(repeated):
         raise InputError(
-            f"{where}: keypoint {repeated[0]} of the first photo is matched more than once; keep its best match"
+            f"{where}: keypoint {repeated[0]} of the first photo is matched more than once; keep the best"
         )
-    partners, counts = np.unique(indices[:, 1], return_counts=True)
+    partners, counts = np.unique(ordered[:, 1], return_counts=True)
     return Matches(
-        indices=indices,
+        indices=ordered,
         ratios=np.full(len(indices), np.nan, np.float32),
-        mutual=np.isin(indices[:, 1], partners[counts == 1]),
-        scores=np.full(len(indices), np.nan, np.float32)
-        if scores is None
-        else scores[order].astype(np.float32),
+        mutual=np.isin(ordered[:, 1], partners[counts == 1]),
+        scores=(np.full(len(indices), np.nan) if scores is None else scores[order]).astype(np.float32),
     )

@@ -64,7 +64,7 @@ class HlocSource:
         self.names = sorted(self._groups)
         if not self.names:
             raise InputError(
-                f"{features}: holds no 'keypoints' of any photo; expected hloc's layout, a group for each photo"
+                f"{features}: holds no 'keypoints' of any photo; expected hloc's layout, a group a photo"
             )
         self._rounded: dict[str, float] = {}
         self._pair_groups: dict[Pair, tuple[h5py.Group, bool]] = {}
@@ -85,7 +85,7 @@ class HlocSource:
         if size is not None and tuple(int(value) for value in size.ravel()[:2]) != image_size:
             raise InputError(
                 f"{where}: features of a photo of {int(size.ravel()[0])} × {int(size.ravel()[1])} pixels, "
-                f"this one has {image_size[0]} × {image_size[1]}; give the photos that they were extracted from"
+                f"this one has {image_size[0]} × {image_size[1]}; give the photos that they are of"
             )
         descriptors = self._optional(group, "descriptors")
         if descriptors is None and self._matches is None:
@@ -121,8 +121,8 @@ class HlocSource:
             raise InputError(f"{where}: matches0 is {stored.dtype}, expected integers, -1 for no match")
         if len(stored) > num0:
             raise InputError(
-                f"{where}: matches of {len(stored)} keypoints, but the photo has {num0}; the matches belong to "
-                "other features"
+                f"{where}: matches of {len(stored)} keypoints, but the first photo has {num0}; the matches "
+                "belong to other features"
             )
         scores = self._optional(group, "matching_scores0")
         if scores is not None and scores.size != stored.size:
@@ -142,8 +142,8 @@ class HlocSource:
         if not self._rounded:
             return []
         return [
-            f"{self._features}: keypoints of {len(self._rounded)} photos are half-precision numbers, which moved "
-            f"them by {np.mean(list(self._rounded.values())):.2f} px on average; in hloc, "
+            f"{self._features}: keypoints of {len(self._rounded)} photos are half-precision numbers, which "
+            f"moved them by {np.mean(list(self._rounded.values())):.2f} px on average; in hloc, "
             "extract_features.main(..., as_half=False) keeps them exact"
         ]
 
@@ -154,8 +154,8 @@ class HlocSource:
         groups = _groups_with(file, "matches0")
         if not groups:
             raise InputError(
-                f"{self._matches}: holds no 'matches0' of any pair; expected hloc's layout, a group name0/name1 "
-                "for each pair"
+                f"{self._matches}: holds no 'matches0' of any pair; expected hloc's layout, a group "
+                "name0/name1 for each pair"
             )
         for path, group in groups.items():
             keys = path.split("/")
@@ -182,7 +182,7 @@ class HlocSource:
             raise InputError(f"{where}: '{key}' cannot be read ({error}); write the file again") from error
 
     def _optional(self, group: h5py.Group, key: str) -> NDArray[Any] | None:
-        return self._read(f"{self._features}: {group.name}", group, key) if key in group else None
+        return self._read(f"{group.file.filename}: {group.name}", group, key) if key in group else None
 
 
 def _surest(

@@ -1,8 +1,9 @@
-"""Importing into a workspace: everything is read and checked against the photos before anything is written."""
+"""Importing into a workspace: everything is read and checked against the photos, then written."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
 import logging
 import shutil
@@ -122,26 +123,36 @@ def import_features(
     if images.mask_dir is not None:
         raise ConfigError("--mask-dir: imported keypoints are not masked; leave out masked ones before")
     folder = Path(workspace)
+    files = cfg.ImportedConfig(
+        features=_absolute(features),
+        matches=_absolute(matches),
+        database=_absolute(database),
+        kind=cfg.FeatureKind(kind),
+    )
     opened: contextlib.AbstractContextManager[Source]
-    if database is not None:
-        opened = open_database(Path(database), with_matches=with_matches)
+    if files.features is not None:
+        opened = open_hloc(files.features, files.matches)
     else:
-        opened = open_hloc(Path(str(features)), None if matches is None else Path(matches))
+        opened = open_database(Path(str(files.database)), with_matches=with_matches)
     is_new = not folder.exists()
     try:
         with opened as source:
-            return _import(source, Path(photos), folder, cfg.FeatureKind(kind), images, overwrite)
+            return _import(source, files, Path(photos), folder, images, overwrite)
     except BaseException:
         if is_new:
             shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
+def _absolute(path: Path | str | None) -> Path | None:
+    return None if path is None else Path(path).absolute()
+
+
 def _import(
     source: Source,
+    files: cfg.ImportedConfig,
     photos: Path,
     folder: Path,
-    kind: cfg.FeatureKind,
     images: cfg.ImagesConfig,
     overwrite: bool,
 ) -> ImportResult:
@@ -150,13 +161,13 @@ def _import(
     with workspace.lock():
         if workspace.features.exists() and not overwrite:
             raise WorkspaceError(
-                f"{workspace.features}: is there already; choose another folder, or add --overwrite to replace "
-                "these features and what was made from them"
+                f"{workspace.features}: is there already; choose another folder, or add --overwrite to "
+                "replace these features and what was made from them"
             )
         index_photos(workspace, photos, images, cfg.RunConfig())
         index = read_index(workspace)
         _check_names(source, photos, index, may_have_more=images.image_list is not None)
-        return _write(source, workspace, index, kind)
+        return _write(source, files, workspace, index)
 
 
 def _check_names(source: Source, photos: Path, index: Index, *, may_have_more: bool) -> None:
@@ -167,17 +178,17 @@ def _check_names(source: Source, photos: Path, index: Index, *, may_have_more: b
         if not known & given:
             hint = f"; its names are like '{source.names[0]}', these photos are like '{index.names[0]}'"
         raise InputError(
-            f"{source.label}: no features of {first_few(lacking)} in {photos}{hint}; give the folder that the "
-            "names are relative to, or leave these photos out with --image-list"
+            f"{source.label}: no features of {first_few(lacking)} in {photos}{hint}; give the folder that "
+            "the names are relative to, or leave these photos out with --image-list"
         )
     if (unknown := sorted(given - known)) and not may_have_more:
         raise InputError(
-            f"{source.label}: features of {first_few(unknown)}, which {photos} does not hold; give all photos, "
-            "or name those to use with --image-list"
+            f"{source.label}: features of {first_few(unknown)}, which {photos} does not hold; give all "
+            "photos, or name those to use with --image-list"
         )
 
 
-def _write(source: Source, workspace: Workspace, index: Index, kind: cfg.FeatureKind) -> ImportResult:
+def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, index: Index) -> ImportResult:
     records = {record.name: record for record in index.records}
 
     def read(name: str) -> Features:
@@ -202,9 +213,8 @@ def _write(source: Source, workspace: Workspace, index: Index, kind: cfg.Feature
         )
     for remark in source.remarks():
         logger.warning("%s", remark)
-    if is_sift:
-        kind = cfg.FeatureKind.SIFT
-    config = cfg.ImportedConfig(source=source.label, kind=kind, has_shapes=has_shapes)
+    kind = cfg.FeatureKind.SIFT if is_sift else files.kind
+    config = dataclasses.replace(files, kind=kind, has_shapes=has_shapes)
     for stage in ("pairs", "matches"):
         workspace.forget(stage)
     complete(

@@ -37,7 +37,7 @@ _IMPORTED = "imported"
 def imported_from(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
     """Where what a stage recorded was imported from; None if the stage made it itself."""
     record = workspace.record_of(stage)
-    if record is None or "source" not in record.config:
+    if record is None or "has_shapes" not in record.config:
         return None
     return cfg.from_dict(cfg.ImportedConfig, record.config, str(workspace.manifest))
 
@@ -55,7 +55,6 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
     WorkspaceError
         If a photo is new or has changed since the import.
     """
-    source = imported_from(workspace, "features")
     records = read_index(workspace).records
     store = ItemStore(workspace.features, FEATURES)
     held = store.held([record.name for record in records])
@@ -66,9 +65,9 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
     ]
     if lacking:
         raise WorkspaceError(
-            f"{workspace.features}: was imported{f' from {source.source}' if source else ''} and holds no "
-            f"features of {first_few(lacking)}, new or changed since; import into another folder again, or "
-            "leave these photos out with --image-list"
+            f"{workspace.features}: was imported and holds no features of {first_few(lacking)}, new or "
+            f"changed since; import again ({workspace.command_for('features')} --overwrite), or leave these "
+            "photos out with --image-list"
         )
     return {record.name: held[record.name] for record in records}
 
