@@ -79,9 +79,7 @@ def test_matches_come_in_and_are_not_made_again(
     photos: Path, features: Path, tmp_path: Path, names: list[str]
 ) -> None:
     write_matches(tmp_path / "matches.h5", [(names[1], names[0]), (names[0], names[2])])
-    result = import_features(
-        photos, tmp_path / "scene", features=features, matches=tmp_path / "matches.h5"
-    )
+    result = import_features(photos, tmp_path / "scene", features=features, matches=tmp_path / "matches.h5")
     assert (result.num_pairs, result.num_matches) == (2, NUM)
     workspace = Workspace(tmp_path / "scene")
     pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
@@ -114,7 +112,9 @@ def test_options_for_other_features_are_refused_before_any_work(
             features=cfg.FeaturesConfig(extractor=cfg.Extractor.DISK),
             workspace_dir=tmp_path / "scene",
         )
-    with pytest.raises(ConfigError, match="lightglue has weights for aliked and disk, these features are other"):
+    with pytest.raises(
+        ConfigError, match="lightglue has weights for aliked and disk, these features are other"
+    ):
         pipeline.check_options(
             RUN,
             matches=cfg.MatchesConfig(matcher=cfg.Matcher.LIGHTGLUE),
@@ -145,7 +145,10 @@ def test_half_precision_keypoints_are_warned_of(
 @pytest.mark.parametrize(
     ("break_it", "text"),
     [
-        (lambda path, name: edit(path, name, "descriptors", None), "has no 'descriptors', only keypoints, scores"),
+        (
+            lambda path, name: edit(path, name, "descriptors", None),
+            "has no 'descriptors', only keypoints, scores",
+        ),
         (
             lambda path, name: edit(path, name, "descriptors", unit_vectors(NUM, 0)),
             r"descriptors have shape \(40, 64\), expected \(D, 40\)",
@@ -162,7 +165,10 @@ def test_half_precision_keypoints_are_warned_of(
             lambda path, name: edit(path, name, "keypoints", np.full((NUM, 2), 5000, np.float32)),
             r"keypoint 0 at \(5000.5, 5000.5\) lies outside of the photo",
         ),
-        (lambda path, name: edit(path, name, "keypoints", np.zeros((NUM, 3), np.float32)), r"shape \(40, 3\)"),
+        (
+            lambda path, name: edit(path, name, "keypoints", np.zeros((NUM, 3), np.float32)),
+            r"shape \(40, 3\)",
+        ),
         (lambda path, name: edit(path, name, "scores", np.zeros(3, np.float32)), r"scores have shape \(3,\)"),
     ],
 )
@@ -259,7 +265,9 @@ def test_a_file_of_another_tool_is_never_overwritten(
         write_matches(folder / name, [(names[0], names[1])])
         holds = "matches of 1 pairs"
     before = (folder / name).read_bytes()
-    with pytest.raises(WorkspaceError, match=f"{name}: another tool wrote it .{holds}.*corrsfm import PHOTOS"):
+    with pytest.raises(
+        WorkspaceError, match=f"{name}: another tool wrote it .{holds}.*corrsfm import PHOTOS"
+    ):
         pipeline.run_scene(photos, folder, cfg.PipelineConfig(run=RUN))
     assert [path.name for path in folder.iterdir()] == [name]
     assert (folder / name).read_bytes() == before
