@@ -7,6 +7,7 @@ costs nothing.
 
     check_photos(photos)                                what to know of photos before a run
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
+    import_features(photos, workspace, features=…)      bring in features and matches of another tool
     open_workspace(folder)                              read what the stages left there
     export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
     Pruner.load()(pairs)                                prune matches of your own
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
     from corrsfm.images.check import PhotosCheck, check_photos
+    from corrsfm.importing.scene import ImportResult, import_features
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
     from corrsfm.prune.correspondences import correspondences_from_points
@@ -41,6 +43,7 @@ __all__ = [
     "Correspondences",
     "ExportResult",
     "Features",
+    "ImportResult",
     "Matches",
     "PhotosCheck",
     "PipelineConfig",
@@ -51,6 +54,7 @@ __all__ = [
     "check_photos",
     "correspondences_from_points",
     "export_scene",
+    "import_features",
     "load_network",
     "open_workspace",
     "run_scene",
@@ -61,6 +65,7 @@ _HOMES = {
     "Correspondences": "types",
     "ExportResult": "export.scene",
     "Features": "types",
+    "ImportResult": "importing.scene",
     "Matches": "types",
     "PhotosCheck": "images.check",
     "PipelineConfig": "config",
@@ -70,6 +75,7 @@ _HOMES = {
     "check_photos": "images.check",
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
+    "import_features": "importing.scene",
     "load_network": "model",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",

@@ -74,7 +74,9 @@ def run_scene(
         What the stages raise. If mapping fails, the report is written all the same, because it tells why.
     """
     run = config.run
-    check_options(run, config.features, config.matches, config.prune, workspace_dir=workspace_dir)
+    check_options(
+        run, config.prune, features=config.features, matches=config.matches, workspace_dir=workspace_dir
+    )
     workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
     with workspace.lock():
         _say(index_photos(workspace, images_dir, config.images, run, overwrite=overwrite))
@@ -117,22 +119,22 @@ def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, A
 
 def check_options(
     run: cfg.RunConfig,
-    features: cfg.FeaturesConfig,
-    matches: cfg.MatchesConfig,
     prune: cfg.PruneConfig | None = None,
     *,
-    workspace_dir: Path,
+    features: cfg.FeaturesConfig | None = None,
+    matches: cfg.MatchesConfig | None = None,
+    workspace_dir: Path | None = None,
 ) -> None:
     """Check the device, the networks and whether the stages fit each other, before any work is done.
 
     Parameters
     ----------
     run : RunConfig
-    features : FeaturesConfig
-    matches : MatchesConfig
     prune : PruneConfig, optional
         The method that comes later; none if matching is the last stage.
-    workspace_dir : Path
+    features : FeaturesConfig, optional
+    matches : MatchesConfig, optional
+    workspace_dir : Path, optional
         Imported features and matches in it are kept; it need not exist.
 
     Raises
@@ -147,8 +149,11 @@ def check_options(
         If the folder holds features or matches of another tool.
     """
     device = find_device(run.device)
-    refuse_foreign_files(workspace_dir)
-    known = Workspace(workspace_dir) if (workspace_dir / "workspace.json").exists() else None
+    features, matches = features or cfg.FeaturesConfig(), matches or cfg.MatchesConfig()
+    known = None
+    if workspace_dir is not None:
+        refuse_foreign_files(workspace_dir)
+        known = Workspace(workspace_dir) if (workspace_dir / "workspace.json").exists() else None
     traits = traits_to_come(known, features, matches)
     if features.extractor.kind != cfg.FeatureKind.SIFT:
         create_extractor(features, device)

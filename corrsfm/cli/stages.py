@@ -78,7 +78,7 @@ def extract(
     from corrsfm import pipeline
     from corrsfm.workspace import Workspace
 
-    pipeline.check_options(run, features, matches, workspace_dir=workspace_dir)
+    pipeline.check_options(run, features=features, matches=matches, workspace_dir=workspace_dir)
     workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
     with workspace.lock():
         outcomes = [

@@ -24,7 +24,6 @@ from corrsfm.config.stages import (
 )
 from corrsfm.config.usage import (
     LIGHTGLUE_KINDS,
-    SIFT_TRAITS,
     FeatureKind,
     MatchInput,
     MatchTraits,
@@ -34,7 +33,6 @@ from corrsfm.config.usage import (
 __all__ = [
     "LARGEST_INT",
     "LIGHTGLUE_KINDS",
-    "SIFT_TRAITS",
     "CameraMode",
     "DatabaseConfig",
     "Extractor",

@@ -181,7 +181,9 @@ class FeaturesConfig:
 class ImportedConfig:
     """Features or matches of another tool, in place of the options of the stage that makes them."""
 
-    source: str = option("", "File that they came from")
+    features: Path | None = option(None, "File of hloc that the features came from")
+    matches: Path | None = option(None, "File of hloc that the matches came from")
+    database: Path | None = option(None, "COLMAP database that both came from")
     kind: FeatureKind = option(FeatureKind.OTHER, "What the features are")
     has_shapes: bool = option(False, "Whether keypoints came with scale and orientation")
 
@@ -259,8 +261,13 @@ class PruneConfig:
         "sfm keeps what mapping can use; pose is strict, for two-view poses",
         used_with=_NETWORK,
     )
-    max_ratio: float = option(
-        0.8, "Largest descriptor distance ratio of the ratio test", above=0, used_with=_RATIO
+    # On validation pairs with ALIKED every ratio up to 0.95 lost poses against none, see docs/guide.md.
+    max_ratio: float | None = option(
+        None,
+        "Largest descriptor distance ratio of the ratio test; if not given 0.8 for SIFT, and mutual matches "
+        "without a ratio test for other features",
+        above=0,
+        used_with=_RATIO,
     )
     max_error_px: float = option(
         4.0, "Inlier threshold of the robust estimators", unit="px", above=0, used_with=_ESTIMATOR

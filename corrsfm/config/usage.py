@@ -7,7 +7,7 @@ from enum import StrEnum
 
 from corrsfm.config.fields import option
 
-__all__ = ["LIGHTGLUE_KINDS", "SIFT_TRAITS", "FeatureKind", "MatchInput", "MatchTraits", "NetworkUsage"]
+__all__ = ["LIGHTGLUE_KINDS", "FeatureKind", "MatchInput", "MatchTraits", "NetworkUsage"]
 
 
 class FeatureKind(StrEnum):
@@ -41,10 +41,6 @@ class MatchTraits:
     features: FeatureKind = FeatureKind.SIFT
     has_shapes: bool = True
     has_ratios: bool = True
-
-
-SIFT_TRAITS = MatchTraits()
-"""Those of our own features and nearest neighbours."""
 
 
 class MatchInput(StrEnum):

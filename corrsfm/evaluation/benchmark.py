@@ -95,9 +95,7 @@ def run_benchmark(
         Grouped by device, size and batch size; the reference first in each group.
     """
     network: CorrAdaptor | Rival = (
-        load_network(model)
-        if model is not None
-        else CorrAdaptor.from_config(NetworkConfig()).eval()
+        load_network(model) if model is not None else CorrAdaptor.from_config(NetworkConfig()).eval()
     )
     reference = PlainCorrAdaptor().eval()
     rows: list[BenchmarkRow] = []

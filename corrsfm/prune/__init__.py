@@ -23,7 +23,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from corrsfm.config import SIFT_TRAITS, FeatureKind, MatchTraits, PruneConfig, PruneMethod
+from corrsfm.config import FeatureKind, MatchTraits, PruneConfig, PruneMethod
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.prune.correspondences import make_correspondences, missing_channels, side_information
 from corrsfm.types import Correspondences, PruneResult
@@ -44,6 +44,8 @@ __all__ = [
 
 logger = logging.getLogger("corrsfm")
 
+SIFT_MAX_RATIO = 0.8
+NO_MAX_RATIO = 1.0
 _WITHOUT_RATIOS = "use --method none, which keeps them for verification, or --method loransac"
 
 
@@ -85,7 +87,7 @@ class PrunerProtocol(Protocol):
 def build_pruner(
     config: PruneConfig,
     *,
-    traits: MatchTraits = SIFT_TRAITS,
+    traits: MatchTraits | None = None,
     device: str = "auto",
     seed: int = 0,
     threads: int = 0,
@@ -96,7 +98,7 @@ def build_pruner(
     ----------
     config : PruneConfig
     traits : MatchTraits
-        What the matches to prune carry.
+        What the matches to prune carry; taken for SIFT's, and not compared with the network, if not given.
     device : str
         Device of the network: auto, cpu, cuda or cuda:N.
     seed : int
@@ -118,26 +120,30 @@ def build_pruner(
     """
     from corrsfm.prune.classical import EstimatorPruner, KeepAll, RatioPruner
 
-    if config.method in (PruneMethod.RATIO, PruneMethod.CASCADE) and not traits.has_ratios:
+    if config.method in (PruneMethod.RATIO, PruneMethod.CASCADE) and traits and not traits.has_ratios:
         raise ConfigError(
             f"--method {config.method}: these matches have no ratio of descriptor distances; "
             f"{_WITHOUT_RATIOS}"
         )
 
+    max_ratio = config.max_ratio
+    if max_ratio is None:
+        is_sift = traits is None or traits.features == FeatureKind.SIFT
+        max_ratio = SIFT_MAX_RATIO if is_sift else NO_MAX_RATIO
     if config.method is PruneMethod.NONE:
         return KeepAll()
     if config.method is PruneMethod.RATIO:
-        return RatioPruner(config.max_ratio)
+        return RatioPruner(max_ratio)
     if config.method.architecture is not None:
         network = _load_network_pruner(config, traits, device, threads)
         if config.method is not PruneMethod.CASCADE:
             return network
         from corrsfm.prune.cascade import CascadePruner
 
-        return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=config.max_ratio)
+        return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=max_ratio)
     return EstimatorPruner(
         str(config.method),
-        max_ratio=config.max_ratio,
+        max_ratio=max_ratio,
         max_error_px=config.max_error_px,
         seed=seed,
         threads=threads,
@@ -180,12 +186,15 @@ def _checkpoint(config: PruneConfig, features: FeatureKind) -> Path | str:
     return weights.default_checkpoint(features)
 
 
-def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, threads: int) -> Pruner:
+def _load_network_pruner(
+    config: PruneConfig, traits: MatchTraits | None, device: str, threads: int
+) -> Pruner:
     # Imported late because it loads torch.
     from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    name = _checkpoint(config, traits.features)
+    features = FeatureKind.SIFT if traits is None else traits.features
+    name = _checkpoint(config, features)
     assert config.method.architecture is not None
     pruner = Pruner.load(
         name,
@@ -197,13 +206,15 @@ def _load_network_pruner(config: PruneConfig, traits: MatchTraits, device: str, 
         precision=config.precision,
         threads=threads,
     )
+    if traits is None:
+        return pruner
     missing = missing_channels(
         pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
     )
     if missing:
         advice = _WITHOUT_RATIOS
         if traits.has_ratios:
-            fits = weights.default_checkpoint(traits.features)
+            fits = weights.default_checkpoint(features)
             has_other = config.method.architecture == PruneMethod.CORRADAPTOR and fits != name
             advice = (f"try --model {fits}, or " if has_other else "try ") + "--method loransac"
         raise CheckpointError(

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from corrsfm.config import MatchInput, to_dict
 from corrsfm.errors import ConfigError
 from corrsfm.model import CorrAdaptor, Rival, RivalConfig, build_network, save_network
+from corrsfm.prune.correspondences import missing_channels
 from corrsfm.training.checkpoint import Average, load_state, save_state
 from corrsfm.training.config import TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
@@ -66,8 +67,8 @@ def train(
     Raises
     ------
     ConfigError
-        If synthetic pairs are wanted for a network that reads mutual matches only; if the output folder holds
-        a run already and ``resume`` is not set.
+        If synthetic pairs are wanted for a network that reads mutual matches only; if the network reads side
+        channels that the pairs lack; if the output folder holds a run already and ``resume`` is not set.
     """
     if recipe.train.input is MatchInput.MUTUAL and recipe.train.synthetic_share > 0:
         raise ConfigError(
@@ -83,6 +84,12 @@ def train(
             negative_share=options.negative_share,
         )
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
+        channels = trainer.network.side_channels
+        if missing := missing_channels(channels, has_shapes=data.has_shapes, has_ratios=True):
+            raise ConfigError(
+                f"network: its {channels} side channels read {missing}, which these pairs lack; set "
+                "side_channels = 2"
+            )
         if trainer.state_path.exists():
             if not resume:
                 raise ConfigError(

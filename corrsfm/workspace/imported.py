@@ -13,10 +13,10 @@ import h5py
 
 from corrsfm import config as cfg
 from corrsfm.errors import ConfigError, WorkspaceError, first_few
-from corrsfm.types import Pair
-from corrsfm.workspace.folder import Workspace
+from corrsfm.types import Pair, PairList
+from corrsfm.workspace.folder import StageRecord, Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES, Kind
-from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
 from corrsfm.workspace.store import ItemStore
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "imported_features",
     "imported_from",
     "imported_matches",
+    "record_imported_pairs",
     "refuse_foreign",
     "refuse_foreign_files",
     "traits_of",
@@ -36,7 +37,7 @@ _IMPORTED = "imported"
 def imported_from(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
     """Where what a stage recorded was imported from; None if the stage made it itself."""
     record = workspace.record_of(stage)
-    if record is None or "source" not in record.config:
+    if record is None or "has_shapes" not in record.config:
         return None
     return cfg.from_dict(cfg.ImportedConfig, record.config, str(workspace.manifest))
 
@@ -54,7 +55,6 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
     WorkspaceError
         If a photo is new or has changed since the import.
     """
-    source = imported_from(workspace, "features")
     records = read_index(workspace).records
     store = ItemStore(workspace.features, FEATURES)
     held = store.held([record.name for record in records])
@@ -65,9 +65,9 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
     ]
     if lacking:
         raise WorkspaceError(
-            f"{workspace.features}: was imported{f' from {source.source}' if source else ''} and holds no "
-            f"features of {first_few(lacking)}, new or changed since; import into another folder again, or "
-            "leave these photos out with --image-list"
+            f"{workspace.features}: was imported and holds no features of {first_few(lacking)}, new or "
+            f"changed since; import again ({workspace.command_for('features')} --overwrite), or leave these "
+            "photos out with --image-list"
         )
     return {record.name: held[record.name] for record in records}
 
@@ -75,6 +75,21 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
 def imported_matches(workspace: Workspace) -> dict[Pair, str]:
     """Fingerprints of imported matches, which are what they are."""
     return ItemStore(workspace.matches, MATCHES).fingerprints(read_pairs(workspace).pairs)
+
+
+def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg.ImportedConfig) -> None:
+    """Write the pairs of imported matches and record them as made by the import."""
+    features = workspace.require("features").fingerprint
+    write_pairs(workspace, pair_list)
+    workspace.finish(
+        "pairs",
+        StageRecord(
+            fingerprint=cfg.config_hash("imported pairs", pair_list.pairs, features),
+            config=cfg.to_dict(source),
+            inputs={"features": features},
+            num_items=len(pair_list),
+        ),
+    )
 
 
 def traits_of(workspace: Workspace) -> cfg.MatchTraits:
