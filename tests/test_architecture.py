@@ -53,8 +53,10 @@ OWNERS: dict[str, set[str]] = {
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},
-    "tqdm": {"cli", "workspace", "reconstruction.stage", "batch", "training", "evaluation"},
+    "tqdm": {"cli", "workspace", "images.stage", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},
+    "PIL": {"images"},
+    "pillow_heif": {"images"},
     "poselib": {"database", "evaluation"},
 }  # fmt: skip
 

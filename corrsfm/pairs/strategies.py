@@ -7,6 +7,7 @@ records which strategies proposed each pair.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import re
 import shlex
@@ -42,6 +43,8 @@ IndexPairs = set[tuple[int, int]]
 MAX_EXHAUSTIVE_PHOTOS = 200
 BLOCK_SIZE = 2048
 LOOP_CLOSURE = "loop-closure"
+# Similar frames paired with each frame of a video; most of them are neighbours in time.
+MAX_LOOPS = 10
 # Semi-axes of the WGS84 ellipsoid.
 EQUATOR_M, POLE_M = 6378137.0, 6356752.314245
 
@@ -52,6 +55,7 @@ def make_pairs(
     *,
     load_features: Callable[[str], Features] | None = None,
     seed: int = 0,
+    is_sequence: bool = False,
 ) -> PairList:
     """Choose the pairs to match.
 
@@ -61,11 +65,14 @@ def make_pairs(
         The photos of the scene.
     config : PairsConfig
         ``auto`` means the strategies file and covisibility if there is a pairs file or a model for them, else
-        exhaustive up to 200 photos and retrieval above. With several strategies the result is their union.
+        neighbours in a sequence and its loops, else exhaustive up to 200 photos and retrieval above. With
+        several strategies the result is their union.
     load_features : callable, optional
         Name → features; needed by retrieval and loop closure only.
     seed : int
         Decides which photos the vocabulary of the retrieval is learned from.
+    is_sequence : bool
+        The photos are frames of a video, named in the order of time.
 
     Returns
     -------
@@ -80,6 +87,12 @@ def make_pairs(
         If a pairs file or model does not fit the photos, or no photo has a GPS position.
     """
     names = sorted(record.name for record in records)
+    if (
+        is_sequence
+        and config.pairing == (PairStrategy.AUTO,)
+        and not (config.pairs_file or config.covisible_model)
+    ):
+        config = _of_sequence(config)
     strategies = _resolve(config, len(names))
     retrieved: IndexPairs | None = None
     loop_closure = config.loop_closure and PairStrategy.SEQUENTIAL in strategies
@@ -111,6 +124,17 @@ def make_pairs(
     if loop_closure:
         proposals[LOOP_CLOSURE] = retrieved or set()
     return _merged(names, proposals)
+
+
+def _of_sequence(config: PairsConfig) -> PairsConfig:
+    """Options for the frames of a video: neighbours in time, near and far, and loops."""
+    return dataclasses.replace(
+        config,
+        pairing=(PairStrategy.SEQUENTIAL,),
+        sequential_quadratic=True,
+        loop_closure=True,
+        num_retrieved=min(config.num_retrieved, MAX_LOOPS),
+    )
 
 
 def _resolve(config: PairsConfig, num_photos: int) -> list[PairStrategy]:
