@@ -16,11 +16,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from corrsfm.config import PairsConfig, PairStrategy
 from corrsfm.errors import ConfigError, InputError, first_few
 from corrsfm.files import read_lines
+from corrsfm.geometry import earth_fixed
 from corrsfm.pairs.retrieval import global_vectors, most_similar
 from corrsfm.types import Features, ImageRecord, PairList
 
@@ -45,8 +45,6 @@ BLOCK_SIZE = 2048
 LOOP_CLOSURE = "loop-closure"
 # Similar frames paired with each frame of a video; most of them are neighbours in time.
 MAX_LOOPS = 10
-# Semi-axes of the WGS84 ellipsoid.
-EQUATOR_M, POLE_M = 6378137.0, 6356752.314245
 
 
 def make_pairs(
@@ -244,7 +242,7 @@ def spatial_pairs(records: Sequence[ImageRecord], num_neighbours: int, max_dista
             f"{len(located)} of {len(ordered)} photos have a GPS position in EXIF, at least two are needed;"
             " choose another --pairing"
         )
-    points = _earth_fixed(np.array([record.gps[:2] for record in ordered if record.gps is not None]))
+    points = earth_fixed(np.array([(*record.gps[:2], 0.0) for record in ordered if record.gps is not None]))
     pairs = set()
     for start in range(0, len(points), BLOCK_SIZE):
         block = points[start : start + BLOCK_SIZE]
@@ -258,21 +256,6 @@ def spatial_pairs(records: Sequence[ImageRecord], num_neighbours: int, max_dista
         for row, column in np.argwhere(near):
             pairs.add(_ordered(int(located[start + row]), int(located[nearest[row, column]])))
     return pairs
-
-
-def _earth_fixed(positions_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) latitude and longitude in degrees → (N, 3) metres from the centre of the earth."""
-    latitude, longitude = np.radians(positions_deg).T
-    flattened = (POLE_M / EQUATOR_M) ** 2
-    radius = EQUATOR_M / np.sqrt(1 - (1 - flattened) * np.sin(latitude) ** 2)
-    return np.stack(
-        [
-            radius * np.cos(latitude) * np.cos(longitude),
-            radius * np.cos(latitude) * np.sin(longitude),
-            flattened * radius * np.sin(latitude),
-        ],
-        axis=1,
-    )
 
 
 def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:

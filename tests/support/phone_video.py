@@ -98,8 +98,6 @@ def _render(
         hit = centre + np.where(np.isfinite(depth), depth, 0.0)[..., None] * rays - np.array(corner, float)
         a, b = (hit @ u / (u @ u)).astype(np.float32), (hit @ v / (v @ v)).astype(np.float32)
         seen = (depth > 0.1) & (depth < nearest) & (a >= 0) & (a <= 1) & (b >= 0) & (b <= 1)
-        shown = cv2.remap(
-            surface, a * (surface.shape[1] - 1), b * (surface.shape[0] - 1), cv2.INTER_LINEAR
-        )
+        shown = cv2.remap(surface, a * (surface.shape[1] - 1), b * (surface.shape[0] - 1), cv2.INTER_LINEAR)
         picture[seen], nearest[seen] = shown[seen], depth[seen]
     return picture
