@@ -104,8 +104,9 @@ def export(
     if result.gps is not None:
         fit, (latitude, longitude, altitude) = result.gps, result.gps.origin
         click.echo(
-            f"GPS: {fit.num_agreeing} of {fit.num_photos} positions agree, the median is {fit.residual_m:.2f} m"
-            f" off; metres east, north and up of {latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"
+            f"GPS: {fit.num_agreeing} of {fit.num_photos} positions agree, the median is "
+            f"{fit.residual_m:.2f} m off; "
+            f"metres east, north and up of {latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"
         )
     if result.num_cropped:
         click.echo(f"cropped: {result.num_cropped:,} points")

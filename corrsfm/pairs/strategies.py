@@ -29,6 +29,7 @@ __all__ = [
     "exhaustive_pairs",
     "make_pairs",
     "natural_order",
+    "num_pairs_expected",
     "read_pairs_file",
     "retrieval_pairs",
     "sequential_pairs",
@@ -122,6 +123,13 @@ def make_pairs(
     if loop_closure:
         proposals[LOOP_CLOSURE] = retrieved or set()
     return _merged(names, proposals)
+
+
+def num_pairs_expected(num_photos: int, config: PairsConfig) -> int:
+    """Pairs that ``auto`` makes of photos; an upper bound where they are chosen by similarity."""
+    every = num_photos * (num_photos - 1) // 2
+    few = num_photos <= MAX_EXHAUSTIVE_PHOTOS
+    return every if few else min(every, num_photos * config.num_retrieved)
 
 
 def _of_sequence(config: PairsConfig) -> PairsConfig:
