@@ -125,6 +125,14 @@ def extract_frames(
         _write(video, folder, frames, {"frames": num_frames, "every": every}, track)
     except OSError as error:
         raise WorkspaceError(f"{folder}: frames cannot be written ({error.strerror})") from error
+    if len(frames) < num_frames:
+        logger.info(
+            "%s: %d frames rather than %d: where it has few frames for its motion, or they are all blurred, "
+            "stretches give none",
+            video.name,
+            len(frames),
+            num_frames,
+        )
     logger.info(
         "%s: %d of %d frames, of %d×%d pixels, %.1f s; the sharpest of each stretch where the camera moves",
         video.name,
@@ -200,9 +208,13 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
     if before == record and there == wanted:
         return
     if before is not None and before.get("options") != options:
+        known = before.get("options", {})
+        changes = (
+            f"{key} {known.get(key)} → {options[key]}" for key in options if known.get(key) != options[key]
+        )
         logger.info(
             "frames: chosen again (%s): %d new, %d kept, %d removed",
-            ", ".join(f"{key} {before['options'].get(key)} → {options[key]}" for key in options),
+            ", ".join(changes),
             len(missing),
             len(there & wanted),
             len(there - wanted),

@@ -99,7 +99,7 @@ def _photos_of(item: Path) -> Iterable[Path]:
             f"video ({', '.join(VIDEO_SUFFIXES)})"
         )
     if not glob.has_magic(str(item)):
-        raise InputError(f"{item}: no such file or folder; expected photos")
+        raise InputError(f"{item}: no such folder or file; expected photos")
     found = [Path(name) for name in sorted(glob.glob(str(item), recursive=True))]
     if not found:
         raise InputError(f"{item}: nothing fits this pattern")
