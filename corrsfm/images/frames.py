@@ -18,16 +18,15 @@ import cv2
 import numpy as np
 
 from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import atomic_path, atomic_write_json, sha256_of
+from corrsfm.files import FRAME_TIMES, atomic_path, atomic_write_json, sha256_of
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 
-__all__ = ["Frame", "extract_frames", "read_frame_times"]
+__all__ = ["Frame", "extract_frames"]
 
 logger = logging.getLogger("corrsfm")
 
 _JPEG_QUALITY = 97
 _MEASURED = ".measured.json"
-_FRAMES = "frames.json"
 # What is measured, and how; a change makes old measurements stale.
 _VERSION = 1
 # Containers count a few frames too many.
@@ -145,15 +144,6 @@ def extract_frames(
     return frames
 
 
-def read_frame_times(folder: Path) -> dict[str, float]:
-    """Name → seconds of the frames in a folder; empty if it holds none of a video."""
-    try:
-        values = json.loads((folder / _FRAMES).read_text(encoding="utf-8"))
-        return {frame["name"]: float(frame["time_s"]) for frame in values["frames"]}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
-
-
 def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: Track) -> Measured:
     """Measurements of every frame, from an earlier call if it was of this video."""
     if not video.is_file():
@@ -178,7 +168,7 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
     # Frames of another video have the same names.
     for name in _frames_in(folder):
         (folder / name).unlink()
-    (folder / _FRAMES).unlink(missing_ok=True)
+    (folder / FRAME_TIMES).unlink(missing_ok=True)
     plain: dict[str, Any] = {
         name: value.tolist() if isinstance(value, np.ndarray) else value
         for name, value in dataclasses.asdict(measured).items()
@@ -200,7 +190,7 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
     }
     there = _frames_in(folder)
     try:
-        before = json.loads((folder / _FRAMES).read_text(encoding="utf-8"))
+        before = json.loads((folder / FRAME_TIMES).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         before = None
     wanted = {frame.name for frame in frames}
@@ -219,7 +209,7 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
             len(there & wanted),
             len(there - wanted),
         )
-    (folder / _FRAMES).unlink(missing_ok=True)
+    (folder / FRAME_TIMES).unlink(missing_ok=True)
     for name in there - wanted:
         (folder / name).unlink()
     by_number = {frame.number: frame for frame in missing}
@@ -227,4 +217,4 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
         _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         with atomic_path(folder / by_number[number].name) as temporary:
             temporary.write_bytes(encoded.tobytes())
-    atomic_write_json(folder / _FRAMES, record)
+    atomic_write_json(folder / FRAME_TIMES, record)

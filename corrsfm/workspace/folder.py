@@ -44,7 +44,7 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import WorkspaceError
-from corrsfm.files import atomic_write_json
+from corrsfm.files import FRAME_TIMES, atomic_write_json
 from corrsfm.workspace.commands import command_for, label_of
 
 __all__ = ["StageRecord", "Workspace"]
@@ -246,7 +246,7 @@ class Workspace:
     @property
     def is_sequence(self) -> bool:
         """Whether the photos are frames of a video, in the order of time."""
-        return self.images_dir.resolve() == self.frames.resolve()
+        return (self.images_dir / FRAME_TIMES).is_file()
 
     def record_of(self, stage: str) -> StageRecord | None:
         """The record of a stage, or None if it never finished."""

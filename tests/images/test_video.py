@@ -16,7 +16,7 @@ from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.cli import main
 from corrsfm.errors import ConfigError, InputError, WorkspaceError
-from corrsfm.images.frames import extract_frames, read_frame_times
+from corrsfm.images.frames import extract_frames
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs
@@ -102,9 +102,9 @@ def test_trembling_hands_do_not_count_as_motion(tmp_path: Path) -> None:
 def test_a_frame_is_read_whole_and_its_time_is_kept(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.avi", sliding(20))
     frames = extract_frames(path, tmp_path / "frames", num_frames=5)
-    kept = read_frame_times(tmp_path / "frames")
+    kept = json.loads((tmp_path / "frames" / "frames.json").read_text())["frames"]
     assert [frame.time_s for frame in frames] == pytest.approx([frame.number / 10 for frame in frames])
-    assert kept == {frame.name: frame.time_s for frame in frames}
+    assert [(k["name"], k["time_s"]) for k in kept] == [(frame.name, frame.time_s) for frame in frames]
     originals = dict(read_frames(path, [frame.number for frame in frames]))
     for frame in frames:
         written = cv2.imread(str(tmp_path / "frames" / frame.name), cv2.IMREAD_GRAYSCALE).astype(int)
@@ -136,7 +136,7 @@ def test_an_interrupted_extraction_leaves_whole_frames_and_goes_on(tmp_path: Pat
         extract_frames(path, folder, num_frames=6, track=interrupt)
     written = sorted(folder.glob("frame_*"))
     assert len(written) == 3 and not list(folder.glob("*.partial")) and not list(folder.glob(".frame*"))
-    assert read_frame_times(folder) == {}
+    assert not (folder / "frames.json").exists()
     stamps = [file.stat().st_mtime_ns for file in written]
     measured_at = (folder / ".measured.json").stat().st_mtime_ns
     assert len(extract_frames(path, folder, num_frames=6)) == 6
