@@ -135,7 +135,7 @@ class FeaturesConfig:
     root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
 
 
-_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
+_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL, PairStrategy.AUTO))
 _SPATIAL = ("pairing", (PairStrategy.SPATIAL,))
 _FILE = ("pairing", (PairStrategy.FILE, PairStrategy.AUTO))
 _COVISIBILITY = ("pairing", (PairStrategy.COVISIBILITY, PairStrategy.AUTO))

@@ -10,12 +10,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 from corrsfm.errors import CorrsfmError, DependencyError, ImageError, InputError, WorkspaceError, first_few
-from corrsfm.files import atomic_path, atomic_write_json
+from corrsfm.files import OWN_RECORD, atomic_path, atomic_write_json
 from corrsfm.images.photos import CONVERTED_SUFFIXES, convert_photo
 
 __all__ = ["is_converted", "possible_originals", "readable_copies", "readable_name"]
-
-_RECORD = ".corrsfm.json"
 
 
 def is_converted(name: str) -> bool:
@@ -62,19 +60,30 @@ def readable_copies(
     InputError
         If two photos would have one name.
     WorkspaceError
-        If the folder holds files that corrsfm did not put there.
+        If the folder holds files of others, or cannot be written.
     """
     copies = Counter(readable_name(name) for name in names)
     if twice := [name for name in names if copies[readable_name(name)] > 1]:
         raise InputError(f"{source}: as JPEG these photos have one name: {first_few(twice)}; rename one")
     record = _record_of(folder)
+    try:
+        return _copy(source, names, folder, record, hash_of)
+    except OSError as error:
+        raise WorkspaceError(f"{folder}: copies of photos cannot be written ({error.strerror})") from error
+
+
+def _copy(
+    source: Path, names: Sequence[str], folder: Path, record: dict[str, str], hash_of: Callable[[Path], str]
+) -> dict[str, CorrsfmError]:
+    """Bring a folder to exactly the copies of these photos; ``record`` says what is there."""
+    copies = {readable_name(name) for name in names}
     failed: dict[str, CorrsfmError] = {}
     folder.mkdir(parents=True, exist_ok=True)
-    for copy in record.keys() - copies.keys():
+    for copy in record.keys() - copies:
         (folder / copy).unlink(missing_ok=True)
         del record[copy]
     # Written before the copies: what is there is ours, even if this call is killed.
-    atomic_write_json(folder / _RECORD, record | {copy: record.get(copy, "") for copy in copies})
+    atomic_write_json(folder / OWN_RECORD, record | {copy: record.get(copy, "") for copy in copies})
     for name in names:
         copy = readable_name(name)
         if not is_converted(name):
@@ -86,7 +95,7 @@ def readable_copies(
                 with atomic_path(folder / copy) as temporary:
                     convert_photo(source / name, temporary)
                 record[copy] = sha256
-                atomic_write_json(folder / _RECORD, record | dict.fromkeys(copies.keys() - record.keys(), ""))
+                atomic_write_json(folder / OWN_RECORD, record | dict.fromkeys(copies - record.keys(), ""))
         except (ImageError, DependencyError) as error:
             failed[name] = error
     return failed
@@ -95,7 +104,7 @@ def readable_copies(
 def _record_of(folder: Path) -> dict[str, str]:
     """Copies in a folder, with the hash of the photo that each was made from."""
     try:
-        return dict(json.loads((folder / _RECORD).read_text(encoding="utf-8")))
+        return dict(json.loads((folder / OWN_RECORD).read_text(encoding="utf-8")))
     except FileNotFoundError:
         if folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise WorkspaceError(

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import FRAME_TIMES, atomic_path, atomic_write_json, sha256_of
+from corrsfm.files import FRAME_TIMES, OWN_RECORD, atomic_path, atomic_write_json, sha256_of
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 
 __all__ = ["Frame", "extract_frames"]
@@ -26,7 +26,6 @@ __all__ = ["Frame", "extract_frames"]
 logger = logging.getLogger("corrsfm")
 
 _JPEG_QUALITY = 97
-_MEASURED = ".measured.json"
 # What is measured, and how; a change makes old measurements stale.
 _VERSION = 1
 # Containers count a few frames too many.
@@ -126,8 +125,7 @@ def extract_frames(
         raise WorkspaceError(f"{folder}: frames cannot be written ({error.strerror})") from error
     if len(frames) < num_frames:
         logger.info(
-            "%s: %d frames rather than %d: where it has few frames for its motion, or they are all blurred, "
-            "stretches give none",
+            "%s: %d frames rather than %d: the other stretches hold no frame, or only blurred ones",
             video.name,
             len(frames),
             num_frames,
@@ -148,7 +146,7 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
     """Measurements of every frame, from an earlier call if it was of this video."""
     if not video.is_file():
         raise InputError(f"{video}: no such file; expected a video")
-    path = folder / _MEASURED
+    path = folder / OWN_RECORD
     others = folder.is_dir() and any(not item.name.startswith(".") for item in folder.iterdir())
     if others and not path.is_file():
         raise WorkspaceError(

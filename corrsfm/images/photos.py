@@ -142,6 +142,8 @@ def _decode_modern(path: Path, content: bytes, advice: str) -> tuple[NDArray[np.
         with Image.open(io.BytesIO(content)) as photo:
             colours = np.asarray(photo.convert("RGB"), np.uint8)
             exif = photo.info.get("exif") or b""
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{path}: has too many pixels to be decoded safely; save it smaller") from error
     except (OSError, ValueError, RuntimeError, SyntaxError) as error:
         raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}") from error
     return np.ascontiguousarray(colours[:, :, ::-1]), exif

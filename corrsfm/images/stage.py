@@ -14,6 +14,7 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
 from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
+from corrsfm.files import OWN_RECORD
 from corrsfm.images.cache import PhotoCache
 from corrsfm.images.convert import is_converted, possible_originals, readable_copies
 from corrsfm.images.frames import extract_frames
@@ -71,6 +72,7 @@ def index_photos(
     elif config.frames or config.every:
         logger.warning("--frames and --every choose frames of a video; they have no effect on photos")
     listed = list_images(folder, image_list=config.image_list, mask_dir=config.mask_dir, chosen=chosen)
+    listed = _without_own(listed, folder, workspace)
     copies, failed = None, {}
     if any(is_converted(name) for name in listed):
         copies = workspace.converted
@@ -136,6 +138,15 @@ def _frames_of(video: Path, folder: Path, config: cfg.ImagesConfig, cache: Photo
         track=lambda items, total, text: tqdm(items, desc=text, total=total, unit="frame", leave=False),
     )
     return tuple(frame.name for frame in frames)
+
+
+def _without_own(names: list[str], folder: Path, workspace: Workspace) -> list[str]:
+    """The photos without those that corrsfm made, where the workspace lies among the photos."""
+    own = []
+    for place in (workspace.frames.resolve(), workspace.converted.resolve()):
+        if folder.resolve() in place.parents and (place / OWN_RECORD).is_file():
+            own.append(f"{place.relative_to(folder.resolve()).as_posix()}/")
+    return [name for name in names if not name.startswith(tuple(own))]
 
 
 def _refuse_vanished_photos(workspace: Workspace, source: PhotoSource) -> None:

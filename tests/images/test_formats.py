@@ -141,6 +141,13 @@ def test_the_workspace_holds_what_every_program_reads(mixed: Path, tmp_path: Pat
     assert read_index(workspace).records[0].gps == (-33.0, -70.0, 520.0)
 
 
+def test_copies_in_a_workspace_among_the_photos_are_no_photos(mixed: Path) -> None:
+    workspace = Workspace(mixed / "corrsfm", create=True)
+    for _ in range(2):
+        pipeline.index_photos(workspace, mixed, cfg.ImagesConfig(), RUN)
+        assert read_index(workspace).names == ["a.jpg", "c.jpg", "sub/b.jpg"]
+
+
 def test_photos_are_converted_once_and_again_when_they_change(mixed: Path, tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "scene", create=True)
     pipeline.index_photos(workspace, mixed, cfg.ImagesConfig(), RUN)

@@ -138,10 +138,10 @@ def test_an_interrupted_extraction_leaves_whole_frames_and_goes_on(tmp_path: Pat
     assert len(written) == 3 and not list(folder.glob("*.partial")) and not list(folder.glob(".frame*"))
     assert not (folder / "frames.json").exists()
     stamps = [file.stat().st_mtime_ns for file in written]
-    measured_at = (folder / ".measured.json").stat().st_mtime_ns
+    measured_at = (folder / ".corrsfm.json").stat().st_mtime_ns
     assert len(extract_frames(path, folder, num_frames=6)) == 6
     assert stamps == [file.stat().st_mtime_ns for file in written]
-    assert measured_at == (folder / ".measured.json").stat().st_mtime_ns
+    assert measured_at == (folder / ".corrsfm.json").stat().st_mtime_ns
 
 
 def test_a_changed_option_chooses_again_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
