@@ -20,11 +20,13 @@ _MAX_SAMPLES = 1000
 _OUTER_RESIDUAL = 3.0
 # Digits of a position in EXIF.
 _RESOLUTION_M = 0.01
-# Second extent over the first, below which positions lie on a line.
+# Second extent over the first, below which photos lie on a line.
 _LEAST_WIDTH = 0.02
-# Extent of the positions over their residual, below which the receiver's noise would set the scale.
-_LEAST_EXTENT = 3.0
 _ADVICE = "give two photos and their distance instead: --scale A B METRES"
+_NARROW = (
+    "--scale gps: the photos were taken on a line, as far as their positions can tell, about which the model "
+    f"could turn; add --upright, which takes up from the cameras, or {_ADVICE}"
+)
 
 Fit = Callable[[NDArray[np.float64], NDArray[np.float64]], "tuple[float, NDArray, NDArray] | None"]
 
@@ -78,8 +80,8 @@ def fit_to_gps(
     Raises
     ------
     InputError
-        If fewer than three photos have a position, the positions lie in one place or on a line, or are too
-        coarse for the extent of the model.
+        If fewer than three photos have a position, or the photos lie in one place or on a line as far as the
+        positions can tell.
     """
     names = [name for name in poses if name in positions]
     if len(names) < 3:
@@ -91,24 +93,27 @@ def fit_to_gps(
     geodetic = np.array([positions[name] for name in names], float)
     origin = np.median(geodetic, axis=0)
     targets = _east_north_up(geodetic, origin)
-    _check_shape(targets, is_upright)
+    if _extents(targets)[0] < _RESOLUTION_M:
+        raise InputError(f"--scale gps: all photos have the same GPS position; {_ADVICE}")
     fit = _fit_turned if is_upright else _fit_any
     found = _least_median(centres, targets, fit, size=2 if is_upright else 3)
     if found is None:
-        raise InputError(f"--scale gps: the photos of the model lie in one place or on a line; {_ADVICE}")
+        raise InputError(_NARROW)
     for _ in range(5):
         residuals = _residuals(found, centres, targets)
         agreeing = residuals <= max(_OUTER_RESIDUAL * float(np.median(residuals)), _RESOLUTION_M)
         found = fit(centres[agreeing], targets[agreeing]) or found
-    _check_shape(targets[agreeing], is_upright)
-    residuals = _residuals(found, centres, targets)
-    residual_m, extent_m = float(np.median(residuals)), float(np.ptp(targets[agreeing], axis=0).max())
-    if extent_m < _LEAST_EXTENT * residual_m:
+    scale, rotation, translation = found
+    residual_m = float(np.median(_residuals(found, centres, targets)))
+    extents = _extents(scale * centres[agreeing])
+    if extents[0] < residual_m:
         raise InputError(
             f"--scale gps: the positions differ from the model by {residual_m:.1f} m in the median, too much "
-            f"for an extent of {extent_m:.1f} m; {_ADVICE}"
+            f"for photos that lie within about {4 * extents[0]:.0f} m; {_ADVICE}"
         )
-    scale, rotation, translation = found
+    # The model, not the positions: their noise gives width to a line.
+    if not is_upright and extents[1] < max(_LEAST_WIDTH * extents[0], residual_m):
+        raise InputError(_NARROW)
     return GpsFit(
         scale=scale,
         rotation=tuple(tuple(float(value) for value in row) for row in rotation),
@@ -139,16 +144,9 @@ def _east_north_up(geodetic: NDArray[np.float64], origin: NDArray[np.float64]) -
     return (earth_fixed(geodetic) - earth_fixed(origin[None])) @ axes.T
 
 
-def _check_shape(targets: NDArray[np.float64], is_upright: bool) -> None:
-    """Refuse positions from which no similarity follows."""
-    extents = np.linalg.svd(targets - targets.mean(axis=0), compute_uv=False)
-    if extents[0] / np.sqrt(len(targets)) < 1e-3:
-        raise InputError(f"--scale gps: all photos have the same GPS position; {_ADVICE}")
-    if not is_upright and extents[1] < _LEAST_WIDTH * extents[0]:
-        raise InputError(
-            "--scale gps: the GPS positions lie on a line, about which the model could turn; add --upright, "
-            f"which takes up from the cameras, or {_ADVICE}"
-        )
+def _extents(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard deviations (3,) along the principal axes of points (N, 3), the largest first."""
+    return np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
 
 
 def _fit_any(

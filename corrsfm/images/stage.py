@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
+import shutil
 import time
 from pathlib import Path
 
@@ -66,6 +67,8 @@ def index_photos(
     cache = PhotoCache(workspace.photo_cache)
     folder, chosen = source.folder, source.names
     if source.video is not None:
+        if overwrite:
+            _remove_own(workspace.frames)
         folder, chosen = workspace.frames, _frames_of(source.video, workspace.frames, config, cache)
         if config.camera_mode is cfg.CameraMode.AUTO:
             config = dataclasses.replace(config, camera_mode=cfg.CameraMode.SINGLE)
@@ -76,6 +79,8 @@ def index_photos(
     copies, failed = None, {}
     if any(is_converted(name) for name in listed):
         copies = workspace.converted
+        if overwrite:
+            _remove_own(copies)
         failed = readable_copies(folder, listed, copies, cache.hash_of)
     with colmap_log(workspace.log):
         records, cameras = index_images(
@@ -138,6 +143,12 @@ def _frames_of(video: Path, folder: Path, config: cfg.ImagesConfig, cache: Photo
         track=lambda items, total, text: tqdm(items, desc=text, total=total, unit="frame", leave=False),
     )
     return tuple(frame.name for frame in frames)
+
+
+def _remove_own(folder: Path) -> None:
+    """Remove photos that corrsfm made, so that they are made again; those of others stay."""
+    if (folder / OWN_RECORD).is_file():
+        shutil.rmtree(folder)
 
 
 def _without_own(names: list[str], folder: Path, workspace: Workspace) -> list[str]:

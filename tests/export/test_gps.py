@@ -86,6 +86,9 @@ def test_positions_on_a_line_need_up_from_the_cameras() -> None:
         placed(enu)
     found = placed(enu, is_upright=True)
     np.testing.assert_allclose(found - found.mean(axis=0), enu - enu.mean(axis=0), atol=2e-3)
+    noisy = enu + np.random.default_rng(4).normal(0, 2.0, enu.shape)
+    with pytest.raises(InputError, match="on a line.*add --upright"):
+        fit_to_gps(cameras(in_model(enu)), geodetic(noisy))
 
 
 @pytest.mark.parametrize(

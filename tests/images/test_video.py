@@ -286,6 +286,15 @@ def test_the_same_command_does_nothing_twice(workspace: Workspace, walk: Film) -
     )
 
 
+def test_overwrite_makes_frames_again(workspace: Workspace, walk: Film, tmp_path: Path) -> None:
+    copied = Workspace(shutil.copytree(workspace.root, tmp_path / "scene"))
+    damaged = copied.frames / read_index(copied).names[0]
+    whole = damaged.read_bytes()
+    damaged.write_bytes(b"damaged")
+    pipeline.index_photos(copied, walk.path, cfg.ImagesConfig(frames=14), RUN, overwrite=True)
+    assert damaged.read_bytes() == whole
+
+
 def test_two_ways_to_choose_frames_exclude_each_other(walk: Film, tmp_path: Path) -> None:
     words = ["extract", str(walk.path), str(tmp_path / "scene"), "--frames", "5", "--every", "1s"]
     result = CliRunner().invoke(main, words)
