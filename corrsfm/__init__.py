@@ -6,6 +6,7 @@ costs nothing.
 ::
 
     check_photos(photos)                                what to know of photos before a run
+    forecast_run(folder, names)                         minutes and disk of a run, by a short measurement
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     open_workspace(folder)                              read what the stages left there
     export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
+    from corrsfm.forecast import Forecast, forecast_run
     from corrsfm.images.check import PhotosCheck, check_photos
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
@@ -41,6 +43,7 @@ __all__ = [
     "Correspondences",
     "ExportResult",
     "Features",
+    "Forecast",
     "Matches",
     "PhotosCheck",
     "PipelineConfig",
@@ -51,6 +54,7 @@ __all__ = [
     "check_photos",
     "correspondences_from_points",
     "export_scene",
+    "forecast_run",
     "load_network",
     "open_workspace",
     "run_scene",
@@ -61,6 +65,7 @@ _HOMES = {
     "Correspondences": "types",
     "ExportResult": "export.scene",
     "Features": "types",
+    "Forecast": "forecast",
     "Matches": "types",
     "PhotosCheck": "images.check",
     "PipelineConfig": "config",
@@ -70,6 +75,7 @@ _HOMES = {
     "check_photos": "images.check",
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
+    "forecast_run": "forecast",
     "load_network": "model",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",

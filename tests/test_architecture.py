@@ -25,7 +25,7 @@ FLOORS: list[tuple[str, set[str]]] = [
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
-    ("a whole run, and what is handed on after it", {"pipeline", "export"}),
+    ("a whole run, its forecast, and what is handed on after it", {"pipeline", "forecast", "export"}),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
 ]
@@ -53,8 +53,10 @@ OWNERS: dict[str, set[str]] = {
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},
-    "tqdm": {"cli", "workspace", "reconstruction.stage", "batch", "training", "evaluation"},
+    "tqdm": {"cli", "workspace", "images.stage", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},
+    "PIL": {"images"},
+    "pillow_heif": {"images"},
     "poselib": {"database", "evaluation"},
 }  # fmt: skip
 

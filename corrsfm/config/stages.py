@@ -112,6 +112,15 @@ class ImagesConfig:
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
     skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
     camera_params: str = option("", "Known intrinsics as comma-separated numbers in COLMAP's order")
+    frames: int = option(
+        0,
+        "Frames taken from a video, the sharpest of as many stretches of equal motion; 0 for as many as its "
+        "motion asks for, up to 300",
+        minimum=0,
+    )
+    every: str = option(
+        "", "From a video the sharpest frame of each stretch of this time, such as 0.5s, where it moves"
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +135,7 @@ class FeaturesConfig:
     root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
 
 
-_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
+_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL, PairStrategy.AUTO))
 _SPATIAL = ("pairing", (PairStrategy.SPATIAL,))
 _FILE = ("pairing", (PairStrategy.FILE, PairStrategy.AUTO))
 _COVISIBILITY = ("pairing", (PairStrategy.COVISIBILITY, PairStrategy.AUTO))
@@ -139,7 +148,8 @@ class PairsConfig:
     pairing: tuple[PairStrategy, ...] = option(
         (PairStrategy.AUTO,),
         "How photos are paired; give it several times for the union. auto: what --pairs-file or "
-        "--covisible-model say if given, else exhaustive up to 200 photos, then retrieval",
+        "--covisible-model say if given, else neighbours in time and loops of a video, else exhaustive up to "
+        "200 photos, then retrieval",
     )
     sequential_overlap: int = option(
         10, "Neighbours on each side in natural name order", minimum=1, used_with=_SEQUENTIAL
