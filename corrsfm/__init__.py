@@ -6,6 +6,7 @@ costs nothing.
 ::
 
     check_photos(photos)                                what to know of photos before a run
+    forecast_run(folder, names)                         minutes and disk of a run, by a short measurement
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     import_features(photos, workspace, features=…)      bring in features and matches of another tool
     open_workspace(folder)                              read what the stages left there
@@ -27,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
+    from corrsfm.forecast import Forecast, forecast_run
     from corrsfm.images.check import PhotosCheck, check_photos
     from corrsfm.importing.scene import ImportResult, import_features
     from corrsfm.model import load_network
@@ -43,6 +45,7 @@ __all__ = [
     "Correspondences",
     "ExportResult",
     "Features",
+    "Forecast",
     "ImportResult",
     "Matches",
     "PhotosCheck",
@@ -54,6 +57,7 @@ __all__ = [
     "check_photos",
     "correspondences_from_points",
     "export_scene",
+    "forecast_run",
     "import_features",
     "load_network",
     "open_workspace",
@@ -65,6 +69,7 @@ _HOMES = {
     "Correspondences": "types",
     "ExportResult": "export.scene",
     "Features": "types",
+    "Forecast": "forecast",
     "ImportResult": "importing.scene",
     "Matches": "types",
     "PhotosCheck": "images.check",
@@ -75,6 +80,7 @@ _HOMES = {
     "check_photos": "images.check",
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
+    "forecast_run": "forecast",
     "import_features": "importing.scene",
     "load_network": "model",
     "open_workspace": "workspace.scene",

@@ -13,7 +13,21 @@ from typing import Any
 
 from corrsfm.errors import InputError, WorkspaceError
 
-__all__ = ["atomic_path", "atomic_write_json", "atomic_write_text", "read_lines", "sha256_of"]
+__all__ = [
+    "FRAME_TIMES",
+    "OWN_RECORD",
+    "atomic_path",
+    "atomic_write_json",
+    "atomic_write_text",
+    "read_lines",
+    "sha256_of",
+]
+
+OWN_RECORD = ".corrsfm.json"
+"""In a folder of photos that corrsfm made: what they were made from. Without it the photos are the user's."""
+
+FRAME_TIMES = "frames.json"
+"""The file beside the frames of a video that lists them in the order of time."""
 
 
 @contextlib.contextmanager

@@ -15,6 +15,7 @@ __all__ = [
     "angle_between_deg",
     "camera_centre",
     "cross_matrix",
+    "earth_fixed",
     "essential_from_pose",
     "pose_error_deg",
     "relative_pose",
@@ -30,6 +31,8 @@ The pruning literature labels matches with it and scores methods by it, from Yi 
 Correspondences" (CVPR 2018) on. At a focal length of 1000 px such a match is about 7 px off each line.
 """
 
+# Semi-axes of the WGS84 ellipsoid.
+_EQUATOR_M, _POLE_M = 6378137.0, 6356752.314245
 
 Pose = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and translation (3,) of ``cam_from_world``."""
@@ -140,6 +143,33 @@ def pose_error_deg(
     if not np.linalg.norm(np.asarray(translation, np.float64)) > 0:
         return rotation_error, 90.0
     return rotation_error, min(direction_error, 180.0 - direction_error)
+
+
+def earth_fixed(geodetic: ArrayLike) -> NDArray[np.float64]:
+    """Points on and above the earth (WGS84), from its centre.
+
+    Parameters
+    ----------
+    geodetic : (N, 3)
+        Latitude and longitude in degrees, height over the ellipsoid in metres.
+
+    Returns
+    -------
+    (N, 3) float64
+        Metres; z towards the north pole, x towards latitude and longitude zero.
+    """
+    latitude, longitude, height = np.asarray(geodetic, np.float64).T
+    latitude, longitude = np.radians(latitude), np.radians(longitude)
+    flattened = (_POLE_M / _EQUATOR_M) ** 2
+    radius = _EQUATOR_M / np.sqrt(1 - (1 - flattened) * np.sin(latitude) ** 2)
+    return np.stack(
+        [
+            (radius + height) * np.cos(latitude) * np.cos(longitude),
+            (radius + height) * np.cos(latitude) * np.sin(longitude),
+            (flattened * radius + height) * np.sin(latitude),
+        ],
+        axis=1,
+    )
 
 
 def wrap_angles(angles: NDArray[np.floating]) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from corrsfm.errors import ReconstructionError
 from corrsfm.features import create_extractor
 from corrsfm.features.stage import extract_features
 from corrsfm.files import atomic_write_json
+from corrsfm.images.sources import Given, whole_folder
 from corrsfm.images.stage import index_photos
 from corrsfm.machine import count_threads, find_device, versions
 from corrsfm.matches.stage import match_pairs
@@ -52,13 +53,15 @@ logger = logging.getLogger("corrsfm")
 
 
 def run_scene(
-    images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
+    photos: Given, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
 ) -> SceneReport:
-    """Go from a folder of photos to models and a report, skipping what is finished.
+    """Go from photos or a video to models and a report, skipping what is finished.
 
     Parameters
     ----------
-    images_dir, workspace_dir : Path
+    photos : Given
+        A folder of photos, a video, photos, a list or a pattern; see `corrsfm.images.sources.find_source`.
+    workspace_dir : Path
     config : PipelineConfig
     overwrite : bool
         Redo finished work.
@@ -77,9 +80,9 @@ def run_scene(
     check_options(
         run, config.prune, features=config.features, matches=config.matches, workspace_dir=workspace_dir
     )
-    workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
+    workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
     with workspace.lock():
-        _say(index_photos(workspace, images_dir, config.images, run, overwrite=overwrite))
+        _say(index_photos(workspace, photos, config.images, run, overwrite=overwrite))
         _say(extract_features(workspace, config.features, run, overwrite=overwrite))
         _say(make_pairs(workspace, config.pairs, run, overwrite=overwrite))
         _say(match_pairs(workspace, config.matches, run, overwrite=overwrite))

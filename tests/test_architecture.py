@@ -25,7 +25,10 @@ FLOORS: list[tuple[str, set[str]]] = [
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
-    ("a whole run, and what comes in before and is handed on after it", {"pipeline", "importing", "export"}),
+    (
+        "a whole run, its forecast, and what comes in before and is handed on after it",
+        {"pipeline", "forecast", "importing", "export"},
+    ),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
 ]
@@ -53,8 +56,10 @@ OWNERS: dict[str, set[str]] = {
     },
     "torch": {"model", "machine", "features", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},
-    "tqdm": {"cli", "workspace", "reconstruction.stage", "batch", "training", "evaluation"},
+    "tqdm": {"cli", "workspace", "images.stage", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},
+    "PIL": {"images"},
+    "pillow_heif": {"images"},
     "poselib": {"database", "evaluation"},
 }  # fmt: skip
 

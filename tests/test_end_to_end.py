@@ -7,10 +7,15 @@ import sys
 import time
 from pathlib import Path
 
+import pycolmap
 import pytest
+from phone_video import FOCAL_PX, film
 
+from corrsfm.colmap.models import poses_of
 from corrsfm.config import Mapper, PruneMethod
+from corrsfm.evaluation.metrics import position_errors, relative_pose_errors
 from corrsfm.evaluation.scenes.score import evaluate_scene
+from corrsfm.geometry import camera_centre
 
 pytestmark = pytest.mark.slow
 
@@ -84,3 +89,33 @@ def test_a_run_killed_again_and_again_ends_like_a_straight_one(tmp_path: Path) -
     run(scene, tmp_path / "killed", *flags)
     assert time.monotonic() - again < 60
     assert not list((tmp_path / "killed").glob("*.partial"))
+
+
+def test_a_phone_video_is_reconstructed_from_its_sharp_frames(tmp_path: Path) -> None:
+    video = film(tmp_path / "walk.mp4")
+    workspace = tmp_path / "scene"
+    words = [
+        "-m",
+        "corrsfm",
+        "-q",
+        "run",
+        str(video.path),
+        str(workspace),
+        "--json",
+        "--max-features",
+        "1500",
+    ]
+    result = subprocess.run([sys.executable, *words], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    names = json.loads(result.stdout)["models"][0]["image_names"]
+    frames = json.loads((workspace / "frames" / "frames.json").read_text())["frames"]
+    assert len(names) == len(frames) >= 12
+    assert not video.blurred & {frame["number"] for frame in frames}
+    model = pycolmap.Reconstruction(workspace / "sparse" / "0")
+    assert len(model.cameras) == 1
+    assert next(iter(model.cameras.values())).mean_focal_length() == pytest.approx(FOCAL_PX, rel=0.03)
+    poses = poses_of(model)
+    truth = {frame["name"]: video.poses[frame["number"]] for frame in frames}
+    centres = [[camera_centre(found[name]) for name in names] for found in (poses, truth)]
+    assert position_errors(*centres).max() < 0.03  # metres, on a walk of 3 m
+    assert relative_pose_errors(poses, truth).max() < 1.0

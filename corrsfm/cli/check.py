@@ -2,63 +2,94 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
 
 from corrsfm.cli.options import echo_json, json_option
-from corrsfm.errors import first_few
+from corrsfm.errors import CorrsfmError, first_few
 
 __all__ = ["check"]
+
+logger = logging.getLogger("corrsfm")
 
 PATH = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("images_dir", metavar="IMAGES", type=PATH)
+@click.argument("photos", metavar="PHOTOS...", nargs=-1, required=True, type=PATH)
 @click.option(
     "--keep",
     type=PATH,
     help="Write the names of the photos to keep here, for --image-list: all but unreadable, blurred and"
     " doubled ones.",
 )
+@click.option("--mask-dir", type=PATH, help="Folder of masks, to be looked at too.")
+@click.option(
+    "--forecast/--no-forecast",
+    default=True,
+    show_default=True,
+    help="Run the first stages on a few photos, about ten seconds, to tell minutes and disk of a run.",
+)
 @click.option("--threads", type=click.IntRange(0), default=0, help="Photos read at a time; 0 is all cores.")
 @json_option
-def check(images_dir: Path, keep: Path | None, threads: int, as_json: bool) -> None:
+def check(
+    photos: tuple[Path, ...],
+    keep: Path | None,
+    mask_dir: Path | None,
+    forecast: bool,
+    threads: int,
+    as_json: bool,
+) -> None:
     """Look at photos before a run.
 
     Finds photos that cannot be read, that are blurred, that show the same from the same place, or whose
-    exposure is far from that of the others, and says what is known of cameras. Ends with code 1 if a run
-    would stop.
+    exposure is far from that of the others, and masks that do not fit, and says what is known of cameras and
+    what a run will cost. Ends with code 1 if a run would stop.
     """
+    from corrsfm.config import PipelineConfig, RunConfig
     from corrsfm.files import atomic_write_text
     from corrsfm.images.check import check_photos
     from corrsfm.machine import count_threads
 
-    result = check_photos(images_dir, threads=count_threads(threads))
+    result = check_photos(photos, mask_dir=mask_dir, threads=count_threads(threads))
+    expected = None
+    if forecast and len(result.kept) > 1:
+        from corrsfm.forecast import forecast_run
+
+        try:
+            config = PipelineConfig(run=RunConfig(threads=threads))
+            expected = forecast_run(result.folder, result.kept, config)
+        except CorrsfmError as error:
+            logger.warning("no forecast: %s", error)
     if keep is not None:
         atomic_write_text(keep, "".join(f"{name}\n" for name in result.kept))
     if as_json:
-        echo_json(result.to_dict())
+        echo_json({**result.to_dict(), "forecast": expected and expected.to_dict()})
     else:
         sizes = Counter((photo.width, photo.height) for photo in result.photos)
         shown = ", ".join(f"{num} of {width}×{height}" for (width, height), num in sizes.most_common())
-        click.echo(f"{images_dir}: {len(result.photos)} photos can be read: {shown}")
+        click.echo(f"{result.folder}: {len(result.photos)} photos can be read: {shown}")
         click.echo(f"cameras proposed: {result.num_cameras}")
         for finding in result.findings:
-            click.echo(f"{finding.kind}: {finding.text}: {first_few(finding.photos)}")
+            named = f": {first_few(finding.photos)}" if finding.photos else ""
+            click.echo(f"{finding.kind}: {finding.text}{named}")
             if finding.next_step:
-                click.echo(f"  next: {_command(images_dir, finding.next_step)}")
+                click.echo(f"  next: {_command(photos, finding.next_step)}")
         if not result.findings:
             click.echo("nothing to object to")
+        if expected is not None:
+            click.echo(f"forecast: {expected}")
     if result.stops_a_run:
         raise click.exceptions.Exit(1)
 
 
-def _command(images_dir: Path, options: str) -> str:
+def _command(photos: Sequence[Path], options: str) -> str:
     """What to paste: the run with more options, after the list is written if they need one."""
-    photos = shlex.quote(str(images_dir))
-    run = f"corrsfm run {photos} scene/ {options}"
-    return f"corrsfm check {photos} --keep keep.txt; {run}" if "keep.txt" in options else run
+    given = shlex.join(map(str, photos))
+    run = f"corrsfm run {given} scene/ {options}"
+    return f"corrsfm check {given} --keep keep.txt --no-forecast; {run}" if "keep.txt" in options else run

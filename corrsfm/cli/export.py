@@ -25,7 +25,26 @@ NEXT = {
 }
 
 
-@click.command(epilog="ply and csv write one file, the others a folder.")
+_BY_GPS = ("gps", "gps", 0.0)
+
+
+class _ExportCommand(click.Command):
+    """A command whose ``--scale`` takes one word, gps, or three."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Write the one word as the three that the option always has."""
+        spelled: list[str] = []
+        for word in args:
+            if word == "--scale=gps":
+                spelled += ["--scale", *map(str, _BY_GPS)]
+            elif word == "gps" and spelled[-1:] == ["--scale"]:
+                spelled += map(str, _BY_GPS)
+            else:
+                spelled.append(word)
+        return super().parse_args(ctx, spelled)
+
+
+@click.command(cls=_ExportCommand, epilog="ply and csv write one file, the others a folder.")
 @click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
 @click.argument("output", metavar="OUT", type=PATH)
 @click.option(
@@ -40,8 +59,9 @@ NEXT = {
     "--scale",
     nargs=3,
     type=(str, str, float),
-    metavar="A B METRES",
-    help="Bring the world to metres: two photos, and how far apart they were taken.",
+    metavar="A B METRES | gps",
+    help="Bring the world to metres: two photos, and how far apart they were taken; or the word gps, to lay "
+    "it on the ground by the positions in EXIF, with axes east, north and up.",
 )
 @click.option(
     "--crop",
@@ -68,13 +88,26 @@ def export(
     from corrsfm.export.scene import export_scene
 
     result = export_scene(
-        workspace_dir, output, target, images_dir=images_dir, upright=upright, scale=scale, crop=crop
+        workspace_dir,
+        output,
+        target,
+        images_dir=images_dir,
+        upright=upright,
+        scale="gps" if scale == _BY_GPS else scale,
+        crop=crop,
     )
     if as_json:
         echo_json(result.to_dict())
         return
     num_all = len(result.photos) + len(result.left_out)
     click.echo(f"{output}: {len(result.photos)} of {num_all} photos, {result.num_points:,} points")
+    if result.gps is not None:
+        fit, (latitude, longitude, altitude) = result.gps, result.gps.origin
+        click.echo(
+            f"GPS: {fit.num_agreeing} of {fit.num_photos} positions agree, the median is "
+            f"{fit.residual_m:.2f} m off; "
+            f"metres east, north and up of {latitude:.7f}, {longitude:.7f}, {altitude:.1f} m"
+        )
     if result.num_cropped:
         click.echo(f"cropped: {result.num_cropped:,} points")
     if result.left_out:

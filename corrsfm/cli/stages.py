@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 __all__ = ["extract", "match", "pairs", "prune", "reconstruct", "report", "run"]
 
-IMAGES = click.argument("images_dir", metavar="IMAGES", type=click.Path(path_type=Path))
+PHOTOS = click.argument(
+    "photos", metavar="PHOTOS...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
 WORKSPACE = click.argument("workspace_dir", metavar="WORKSPACE", type=click.Path(path_type=Path))
 
 
@@ -51,7 +53,7 @@ def _step(
 
 
 @click.command(cls=SectionedCommand, most_used=("max_features", "camera_mode", "pairing"))
-@IMAGES
+@PHOTOS
 @WORKSPACE
 @config_options(
     images=cfg.ImagesConfig, features=cfg.FeaturesConfig, pairs=cfg.PairsConfig, matches=cfg.MatchesConfig
@@ -60,7 +62,7 @@ def _step(
 @overwrite_option
 @json_option
 def extract(
-    images_dir: Path,
+    photos: tuple[Path, ...],
     workspace_dir: Path,
     images: cfg.ImagesConfig,
     features: cfg.FeaturesConfig,
@@ -72,17 +74,19 @@ def extract(
 ) -> None:
     """Index photos, extract features, match.
 
-    Lists the photos and their cameras, extracts SIFT features or those of a network, chooses pairs and finds
-    the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
+    PHOTOS is a folder, a video, or any of several folders, photos, lists of photos (.txt) and quoted
+    patterns. Lists the photos and their cameras, extracts SIFT features or those of a network, chooses pairs
+    and finds the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm import pipeline
+    from corrsfm.images.sources import whole_folder
     from corrsfm.workspace import Workspace
 
     pipeline.check_options(run, features=features, matches=matches, workspace_dir=workspace_dir)
-    workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
+    workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
     with workspace.lock():
         outcomes = [
-            pipeline.index_photos(workspace, images_dir, images, run, overwrite=overwrite),
+            pipeline.index_photos(workspace, photos, images, run, overwrite=overwrite),
             pipeline.extract_features(workspace, features, run, overwrite=overwrite),
             pipeline.make_pairs(workspace, pairs, run, overwrite=overwrite),
             pipeline.match_pairs(workspace, matches, run, overwrite=overwrite),
@@ -190,21 +194,26 @@ def report(workspace_dir: Path, as_json: bool) -> None:
     most_used=("method", "max_features", "camera_mode", "pairing", "file"),
     epilog="The other headings are the tables of a pipeline file: --max-ratio is max_ratio in [prune].",
 )
-@IMAGES
+@PHOTOS
 @WORKSPACE
 @pipeline_options
 @overwrite_option
 @json_option
 def run(
-    images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, overwrite: bool, as_json: bool
+    photos: tuple[Path, ...],
+    workspace_dir: Path,
+    config: cfg.PipelineConfig,
+    overwrite: bool,
+    as_json: bool,
 ) -> None:
     """Do everything, from photos to a report.
 
-    Finished work is kept: after an interruption or a changed option, run the same command again.
+    PHOTOS is a folder, a video, or any of several folders, photos, lists of photos (.txt) and quoted
+    patterns. Finished work is kept: after an interruption or a changed option, run the same command again.
     """
     from corrsfm.pipeline import run_scene
 
-    result = run_scene(images_dir, workspace_dir, config, overwrite=overwrite)
+    result = run_scene(photos, workspace_dir, config, overwrite=overwrite)
     _show_report(result, as_json, workspace_dir / "report.html")
 
 

@@ -148,6 +148,15 @@ class ImagesConfig:
     camera_model: str = option("SIMPLE_RADIAL", "COLMAP camera model")
     skip_unreadable: bool = option(False, "Go on without photos that cannot be read instead of stopping")
     camera_params: str = option("", "Known intrinsics as comma-separated numbers in COLMAP's order")
+    frames: int = option(
+        0,
+        "Frames taken from a video, the sharpest of as many stretches of equal motion; 0 for as many as its "
+        "motion asks for, up to 300",
+        minimum=0,
+    )
+    every: str = option(
+        "", "From a video the sharpest frame of each stretch of this time, such as 0.5s, where it moves"
+    )
 
 
 _SIFT = ("extractor", (Extractor.OPENCV, Extractor.PYCOLMAP))
@@ -188,7 +197,7 @@ class ImportedConfig:
     has_shapes: bool = option(False, "Whether keypoints came with scale and orientation")
 
 
-_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL,))
+_SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL, PairStrategy.AUTO))
 _SPATIAL = ("pairing", (PairStrategy.SPATIAL,))
 _FILE = ("pairing", (PairStrategy.FILE, PairStrategy.AUTO))
 _COVISIBILITY = ("pairing", (PairStrategy.COVISIBILITY, PairStrategy.AUTO))
@@ -201,7 +210,8 @@ class PairsConfig:
     pairing: tuple[PairStrategy, ...] = option(
         (PairStrategy.AUTO,),
         "How photos are paired; give it several times for the union. auto: what --pairs-file or "
-        "--covisible-model say if given, else exhaustive up to 200 photos, then retrieval",
+        "--covisible-model say if given, else neighbours in time and loops of a video, else exhaustive up to "
+        "200 photos, then retrieval",
     )
     sequential_overlap: int = option(
         10, "Neighbours on each side in natural name order", minimum=1, used_with=_SEQUENTIAL

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pycolmap
@@ -16,13 +16,16 @@ from corrsfm.colmap.models import poses_of, read_models
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.export import ExportTarget
 from corrsfm.export.colmap import write_colmap, write_colmap3
+from corrsfm.export.gps import GpsFit, fit_to_gps
 from corrsfm.export.hloc import write_hloc
 from corrsfm.export.mvs import write_bundler, write_nvm, write_openmvs
 from corrsfm.export.photos import check_photos
 from corrsfm.export.tables import write_csv, write_ply
 from corrsfm.export.trainers import write_nerfstudio, write_splat
-from corrsfm.export.world import common_up, crop_to_bulk, scale_of, similarity, turn_to_z
+from corrsfm.export.world import common_up, crop_to_bulk, held_upright, scale_of, similarity, turn_to_z
 from corrsfm.files import atomic_path
+from corrsfm.geometry import Pose
+from corrsfm.images.photos import read_photo_info
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
 
@@ -53,6 +56,8 @@ class ExportResult:
         Points of the exported model, and how many cropping dropped.
     scale : float
         Exported units per unit of ``sparse/0``; metres if a distance was given.
+    gps : GpsFit or None
+        How the model lies on the ground, if it was fitted to GPS positions; of the model after ``upright``.
     rotation : tuple of tuple of float
         Rows of the rotation (3, 3) from the axes of ``sparse/0`` to the exported ones, those of the target's
         own convention apart.
@@ -68,6 +73,7 @@ class ExportResult:
     num_cropped: int
     scale: float
     rotation: tuple[tuple[float, ...], ...]
+    gps: GpsFit | None
     verdict: str | None
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,7 +88,7 @@ def export_scene(
     *,
     images_dir: Path | str | None = None,
     upright: bool = False,
-    scale: tuple[str, str, float] | None = None,
+    scale: tuple[str, str, float] | Literal["gps"] | None = None,
     crop: bool = False,
 ) -> ExportResult:
     """Export the model ``sparse/0`` of a workspace with its photos for another tool.
@@ -97,8 +103,9 @@ def export_scene(
         Where the photos are now, if not where they were reconstructed from.
     upright : bool
         Turn the world so that the cameras' common up is +z.
-    scale : (str, str, float), optional
-        Two photos and the distance of their centres in metres.
+    scale : (str, str, float) or "gps", optional
+        Two photos and the distance of their centres in metres; or ``gps``, to fit the model to the positions
+        in EXIF: metres east, north and up of their middle, turned about +z only with ``upright``.
     crop : bool
         Drop points outside twice the box that holds the middle 90 % of them along each axis.
 
@@ -129,10 +136,18 @@ def export_scene(
     if target not in _WITHOUT_PHOTOS:
         check_photos(model, photos, {record.name: record.sha256 for record in index.records})
 
-    turn = turn_to_z(common_up(poses_of(model).values())) if upright else np.eye(3)
-    factor = scale_of(model, *scale) if scale is not None else 1.0
-    if upright or scale is not None:
-        model.transform(similarity(turn, factor))
+    turn, factor, fit = np.eye(3), 1.0, None
+    if upright:
+        turn = turn_to_z(common_up(_as_held(model, photos)))
+        model.transform(similarity(turn, 1.0))
+    if scale == "gps":
+        positions = {record.name: record.gps for record in index.records if record.gps is not None}
+        fit = fit_to_gps(poses_of(model), positions, is_upright=upright)
+        turn, factor = np.array(fit.rotation) @ turn, fit.scale
+        model.transform(similarity(fit.rotation, fit.scale, fit.translation))
+    elif scale is not None:
+        factor = scale_of(model, *scale)
+        model.transform(similarity(np.eye(3), factor))
     num_cropped = crop_to_bulk(model) if crop else 0
     if target in _NEED_POINTS and not model.num_points3D():
         raise InputError(f"{source.sparse / '0'}: holds no points, which --for {target} needs")
@@ -141,7 +156,7 @@ def export_scene(
         with atomic_path(path) as temporary:
             if target not in _FILES:
                 temporary.mkdir()
-            _writers(source, photos, upright)[target](model, temporary)
+            _writers(source, photos, upright or fit is not None)[target](model, temporary)
     except OSError as error:
         raise WorkspaceError(
             f"{path}: cannot be written ({error.strerror}); nothing is left there"
@@ -155,8 +170,17 @@ def export_scene(
         num_cropped=num_cropped,
         scale=factor,
         rotation=tuple(tuple(float(value) for value in row) for row in turn),
+        gps=fit,
         verdict=_verdict_of(source),
     )
+
+
+def _as_held(model: pycolmap.Reconstruction, photos: Path) -> list[Pose]:
+    """Poses of the cameras, turned as EXIF says where the photos are there."""
+    return [
+        held_upright(pose, read_photo_info(photos / name).orientation if (photos / name).is_file() else 1)
+        for name, pose in poses_of(model).items()
+    ]
 
 
 def _writers(

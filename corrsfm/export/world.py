@@ -6,13 +6,13 @@ from collections.abc import Iterable
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from corrsfm.colmap.models import poses_of
 from corrsfm.errors import InputError, first_few
 from corrsfm.geometry import Pose, camera_centre
 
-__all__ = ["common_up", "crop_to_bulk", "scale_of", "similarity", "turn_to_z"]
+__all__ = ["common_up", "crop_to_bulk", "held_upright", "scale_of", "similarity", "turn_to_z"]
 
 # Mean length of the cameras' up axes; below it they point everywhere.
 _LEAST_AGREEMENT = 0.5
@@ -22,9 +22,23 @@ _LEAST_TURNING = 0.02
 _OUTER_SHARE = 0.05
 
 
-def similarity(rotation: NDArray[np.float64], scale: float) -> pycolmap.Sim3d:
-    """The similarity x ↦ scale · rotation · x."""
-    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(rotation), np.zeros(3))
+def similarity(rotation: ArrayLike, scale: float, translation: ArrayLike = (0.0, 0.0, 0.0)) -> pycolmap.Sim3d:
+    """The similarity x ↦ scale · rotation · x + translation."""
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(np.asarray(rotation)), np.asarray(translation))
+
+
+# EXIF orientation → axes right, down and forward of the photo as shown, in those of the photo as stored.
+_SHOWN_FROM_STORED = {
+    3: np.diag([-1.0, -1.0, 1.0]),
+    6: np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+    8: np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+}
+
+
+def held_upright(pose: Pose, orientation: int) -> Pose:
+    """The pose of a camera turned as EXIF says the photo is to be shown; mirrored photos stay as they are."""
+    turn = _SHOWN_FROM_STORED.get(orientation, np.eye(3))
+    return turn @ pose[0], turn @ pose[1]
 
 
 def common_up(poses: Iterable[Pose]) -> NDArray[np.float64]:

@@ -43,6 +43,8 @@ class PhotoInfo:
         Make, model and focal length setting from EXIF.
     focal_px : float or None
         Focal length in pixels from EXIF.
+    orientation : int
+        From EXIF, 1 to 8; 1 is upright as stored.
     gps : tuple of float or None
         Latitude and longitude in degrees, altitude in metres; 0 if the altitude is not known.
     """
@@ -51,6 +53,7 @@ class PhotoInfo:
     height: int
     camera_name: str | None = None
     focal_px: float | None = None
+    orientation: int = 1
     gps: tuple[float, float, float] | None = None
 
 

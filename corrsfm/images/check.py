@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.errors import ImageError
+from corrsfm.errors import DependencyError, ImageError, InputError
 from corrsfm.files import sha256_of
 from corrsfm.graph import connected_components
 from corrsfm.images.cameras import PhotoInfo
-from corrsfm.images.listing import list_images
-from corrsfm.images.photos import read_image, read_photo_info
+from corrsfm.images.listing import find_masks, list_images
+from corrsfm.images.photos import read_image, read_mask, read_photo_info
 from corrsfm.images.quality import brightness_stops, hash_distances, perceptual_hash, sharp_detail
+from corrsfm.images.sources import Given, find_source
 
 __all__ = ["Finding", "PhotoCheck", "PhotosCheck", "check_photos"]
 
@@ -40,6 +41,8 @@ class PhotoCheck:
     name : str
     width, height : int
         Pixels as stored.
+    orientation : int
+        From EXIF; 1 is upright as stored.
     camera_name : str or None
     focal_px : float or None
         From EXIF.
@@ -52,6 +55,7 @@ class PhotoCheck:
     name: str
     width: int
     height: int
+    orientation: int
     camera_name: str | None
     focal_px: float | None
     sharpness: float
@@ -65,7 +69,7 @@ class Finding:
     Attributes
     ----------
     kind : str
-        ``unreadable``, ``duplicate``, ``blurred``, ``exposure`` or ``focal``.
+        ``unreadable``, ``masks``, ``duplicate``, ``blurred``, ``exposure``, ``rotation`` or ``focal``.
     text : str
     photos : tuple of str
         Of duplicates those that could go: the sharpest of each group stays.
@@ -85,19 +89,23 @@ class PhotosCheck:
 
     Attributes
     ----------
+    folder : Path
+        Names of photos are relative to it.
     photos : tuple of PhotoCheck
         Those that can be read, sorted by name.
     findings : tuple of Finding
         The gravest first.
     """
 
+    folder: Path
     photos: tuple[PhotoCheck, ...]
     findings: tuple[Finding, ...]
 
     @property
     def stops_a_run(self) -> bool:
         """Whether `corrsfm run` would end with an error."""
-        return len(self.photos) < 2 or any(finding.kind == "unreadable" for finding in self.findings)
+        stopping = ("unreadable", "masks")
+        return len(self.photos) < 2 or any(finding.kind in stopping for finding in self.findings)
 
     @property
     def num_cameras(self) -> int:
@@ -119,6 +127,7 @@ class PhotosCheck:
         """Plain values for JSON."""
         return {
             **asdict(self),
+            "folder": str(self.folder),
             "num_cameras": self.num_cameras,
             "stops_a_run": self.stops_a_run,
             "kept": self.kept,
@@ -136,12 +145,15 @@ class _Look:
     bits: NDArray[np.bool_]
 
 
-def check_photos(folder: Path | str, *, threads: int = 1) -> PhotosCheck:
-    """Look at every photo of a folder once.
+def check_photos(photos: Given, *, mask_dir: Path | str | None = None, threads: int = 1) -> PhotosCheck:
+    """Look at every photo once.
 
     Parameters
     ----------
-    folder : path
+    photos : Given
+        A folder, photos, a list or a pattern; see `corrsfm.images.sources.find_source`.
+    mask_dir : path, optional
+        Folder of their masks, to be looked at too.
     threads : int
         Photos read at a time.
 
@@ -152,17 +164,23 @@ def check_photos(folder: Path | str, *, threads: int = 1) -> PhotosCheck:
     Raises
     ------
     InputError
-        If there is no such folder or it holds fewer than two photos.
+        If there is no such folder or it holds fewer than two photos, or they are a video.
     """
-    folder = Path(folder)
-    names = list_images(folder)
+    source = find_source(photos)
+    if source.video is not None:
+        raise InputError(
+            f"{source.video}: is a video; its frames are chosen and looked at by: corrsfm extract VIDEO "
+            "WORKSPACE, then corrsfm check WORKSPACE/frames"
+        )
+    folder, masks = source.folder, Path(mask_dir) if mask_dir is not None else None
+    names = list_images(folder, mask_dir=masks, chosen=source.names)
 
     def look(name: str) -> _Look | str:
         try:
             grey = read_image(folder / name)
             info = read_photo_info(folder / name)
             sha256 = sha256_of(folder / name)
-        except ImageError as error:
+        except (ImageError, DependencyError) as error:
             return str(error)
         return _Look(info, sha256, sharp_detail(grey), brightness_stops(grey), perceptual_hash(grey))
 
@@ -171,11 +189,12 @@ def check_photos(folder: Path | str, *, threads: int = 1) -> PhotosCheck:
     looks = {name: result for name, result in results.items() if isinstance(result, _Look)}
     median_sharp = float(np.median([value.sharp for value in looks.values()])) if looks else 0.0
     median_stops = float(np.median([value.stops for value in looks.values()])) if looks else 0.0
-    photos = tuple(
+    checked = tuple(
         PhotoCheck(
             name=name,
             width=value.info.width,
             height=value.info.height,
+            orientation=value.info.orientation,
             camera_name=value.info.camera_name,
             focal_px=value.info.focal_px,
             sharpness=value.sharp / median_sharp if median_sharp else 0.0,
@@ -183,22 +202,60 @@ def check_photos(folder: Path | str, *, threads: int = 1) -> PhotosCheck:
         )
         for name, value in looks.items()
     )
-    unreadable = tuple(name for name, result in results.items() if isinstance(result, str))
     findings = [
-        _unreadable(unreadable),
+        _unreadable({name: result for name, result in results.items() if isinstance(result, str)}),
+        _masks(masks, folder, checked),
         _duplicates(looks),
-        _blurred(photos),
-        _exposure(photos),
-        _focal(photos),
+        _blurred(checked),
+        _exposure(checked),
+        _rotation(checked),
+        _focal(checked),
     ]
-    return PhotosCheck(photos=photos, findings=tuple(finding for finding in findings if finding))
+    return PhotosCheck(
+        folder=folder, photos=checked, findings=tuple(finding for finding in findings if finding)
+    )
 
 
-def _unreadable(names: tuple[str, ...]) -> Finding | None:
+def _unreadable(errors: dict[str, str]) -> Finding | None:
+    if not errors:
+        return None
+    missing = next((error for error in errors.values() if "pip install" in error), "")
+    text = f"{len(errors)} cannot be read and would stop a run" + (f" ({missing})" if missing else "")
+    return Finding(kind="unreadable", text=text, photos=tuple(errors), next_step="--skip-unreadable")
+
+
+def _masks(mask_dir: Path | None, folder: Path, photos: Sequence[PhotoCheck]) -> Finding | None:
+    """Masks that cannot be used, or that there are none; `find_masks` warns of masks of no photo."""
+    if mask_dir is None or not photos:
+        return None
+    wrong: dict[str, str] = {}
+    try:
+        masks = find_masks(mask_dir, folder, [photo.name for photo in photos])
+    except InputError as error:
+        return Finding(kind="masks", text=str(error), photos=())
+    for photo, mask in zip(photos, masks, strict=True):
+        try:
+            if mask is not None and not read_mask(mask_dir / mask, (photo.height, photo.width)).any():
+                wrong[photo.name] = f"{mask_dir / mask}: hides the whole photo"
+        except ImageError as error:
+            wrong[photo.name] = str(error)
+    if not wrong:
+        return None
+    text = (
+        f"{len(wrong)} of {len(photos)} photos have a mask that cannot be used ({next(iter(wrong.values()))})"
+    )
+    return Finding(kind="masks", text=text, photos=tuple(wrong))
+
+
+def _rotation(photos: Sequence[PhotoCheck]) -> Finding | None:
+    names = tuple(photo.name for photo in photos if photo.orientation != 1)
     if not names:
         return None
-    text = f"{len(names)} cannot be read and would stop a run"
-    return Finding(kind="unreadable", text=text, photos=names, next_step="--skip-unreadable")
+    text = (
+        f"{len(names)} are turned by EXIF when shown; they are used as stored, as COLMAP does, so masks and "
+        "known intrinsics must be of the stored pixels"
+    )
+    return Finding(kind="rotation", text=text, photos=names)
 
 
 def _duplicates(looks: dict[str, _Look]) -> Finding | None:

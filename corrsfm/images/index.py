@@ -5,14 +5,15 @@ from __future__ import annotations
 import logging
 import unicodedata
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from corrsfm.config import ImagesConfig
-from corrsfm.errors import ImageError, InputError, first_few
+from corrsfm.errors import CorrsfmError, DependencyError, ImageError, InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.images.cameras import PhotoInfo, assign_cameras
+from corrsfm.images.convert import readable_name
 from corrsfm.images.listing import find_masks, list_images
 from corrsfm.images.photos import read_photo_info
 from corrsfm.types import Camera, ImageRecord
@@ -29,6 +30,9 @@ def index_images(
     threads: int = 1,
     hash_of: Callable[[Path], str] | None = None,
     info_of: Callable[[Path], PhotoInfo] | None = None,
+    photos: Sequence[str] | None = None,
+    copies: Path | None = None,
+    failed: Mapping[str, CorrsfmError] | None = None,
 ) -> tuple[list[ImageRecord], list[Camera]]:
     """List the photos of a scene with their hashes, cameras and positions.
 
@@ -40,6 +44,13 @@ def index_images(
         Photos whose headers are read at a time.
     hash_of, info_of : callable, optional
         Replacements for `corrsfm.files.sha256_of` and `read_photo_info`, such as a cache.
+    photos : sequence of str, optional
+        Names of the photos, if they have been listed already.
+    copies : Path, optional
+        Folder of `readable_copies` of the photos. The records then name the copies; masks are named like the
+        photos.
+    failed : mapping, optional
+        Photos that could not be copied, and why.
 
     Returns
     -------
@@ -53,28 +64,39 @@ def index_images(
     ImageError
         Naming every photo that cannot be read.
     InputError
-        If there are fewer than two photos, or the list, the masks or the cameras do not fit them.
+        If a package is missing that reads them, there are fewer than two photos, or the list, the masks or
+        the cameras do not fit them.
     """
     hash_of = hash_of or sha256_of
     info_of = info_of or read_photo_info
-    names = list_images(folder, image_list=config.image_list, mask_dir=config.mask_dir)
+    failed = failed or {}
+    if photos is None:
+        photos = list_images(folder, image_list=config.image_list, mask_dir=config.mask_dir)
+    place = copies or folder
+    named = {photo: readable_name(photo) if copies else photo for photo in photos}
 
-    def read(name: str) -> tuple[str, PhotoInfo] | ImageError:
+    def read(photo: str) -> tuple[str, PhotoInfo] | CorrsfmError:
+        if photo in failed:
+            return failed[photo]
         try:
-            info = info_of(folder / name)
-            return hash_of(folder / name), info
-        except ImageError as error:
+            info = info_of(place / named[photo])
+            return hash_of(place / named[photo]), info
+        except (ImageError, DependencyError) as error:
             return error
 
     with ThreadPoolExecutor(threads) as pool:
-        results = list(pool.map(read, names))
-    unreadable = [str(result) for result in results if isinstance(result, ImageError)]
+        results = dict(zip(photos, pool.map(read, photos), strict=True))
+    unreadable = [result for result in results.values() if isinstance(result, CorrsfmError)]
     if unreadable and not config.skip_unreadable:
-        raise ImageError("\n".join(unreadable) + "\n--skip-unreadable goes on without such photos")
-    for text in unreadable:
-        logger.warning("left out: %s", text)
-    names = [n for n, result in zip(names, results, strict=True) if not isinstance(result, ImageError)]
-    found = [result for result in results if not isinstance(result, ImageError)]
+        raise _refusal(unreadable)
+    for error in unreadable:
+        logger.warning("left out: %s", error)
+    # Sorted by the names of the copies, which are those of the photos but for the suffix.
+    photos = sorted(
+        (photo for photo in photos if not isinstance(results[photo], CorrsfmError)), key=named.__getitem__
+    )
+    names = [named[photo] for photo in photos]
+    found = [result for photo in photos if not isinstance(result := results[photo], CorrsfmError)]
     if len(names) < 2:
         raise InputError(f"{folder}: only {len(names)} photos can be read; at least two are needed")
     cameras, camera_ids = assign_cameras(
@@ -84,7 +106,7 @@ def index_images(
         model=config.camera_model,
         params=config.camera_params,
     )
-    masks = find_masks(config.mask_dir, folder, names)
+    masks = find_masks(config.mask_dir, folder, photos)
     records = [
         ImageRecord(
             name=name,
@@ -97,6 +119,15 @@ def index_images(
         for name, camera_id, (sha256, info), mask in zip(names, camera_ids, found, masks, strict=True)
     ]
     return records, cameras
+
+
+def _refusal(errors: Sequence[CorrsfmError]) -> CorrsfmError:
+    """One error for all photos that cannot be read; the same package may be missing for all of them."""
+    advice = "--skip-unreadable goes on without such photos"
+    if all(isinstance(error, DependencyError) for error in errors):
+        rest = f"; so {len(errors) - 1} more photos" if len(errors) > 1 else ""
+        return InputError(f"{errors[0]}{rest}\n{advice}")
+    return ImageError("\n".join([*map(str, errors), advice]))
 
 
 def name_remarks(names: Sequence[str]) -> list[str]:

@@ -10,20 +10,28 @@ from pathlib import Path, PurePosixPath
 
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import read_lines
+from corrsfm.images.photos import CONVERTED_SUFFIXES
 
-__all__ = ["IMAGE_SUFFIXES", "find_masks", "list_images"]
+__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "find_masks", "list_images", "photos_below"]
 
-IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
-# Photos that neither OpenCV nor pycolmap reads: phones' and cameras' own formats.
+IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp", *CONVERTED_SUFFIXES)
+VIDEO_SUFFIXES = (".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
+# Photos that are not read: cameras' own formats, whose brightness and colours a developer has to choose.
 _FOREIGN_SUFFIXES = (
-    ".arw", ".avif", ".cr2", ".cr3", ".dng", ".gif", ".heic", ".heif", ".jp2", ".jxl", ".nef", ".orf", ".pef",
-    ".raf", ".raw", ".rw2", ".srw",
+    ".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2",
+    ".srw",
 )  # fmt: skip
 
 logger = logging.getLogger("corrsfm")
 
 
-def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path | None = None) -> list[str]:
+def list_images(
+    folder: Path,
+    *,
+    image_list: Path | None = None,
+    mask_dir: Path | None = None,
+    chosen: Sequence[str] | None = None,
+) -> list[str]:
     """Names of the photos in a folder and its sub-folders, sorted.
 
     Parameters
@@ -36,6 +44,8 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
     mask_dir : Path, optional
         Folder of masks. If it lies inside the folder, nothing in it is a photo; if it is the folder itself,
         ``NAME.png`` beside a photo ``NAME`` is not a photo. A list overrules this.
+    chosen : sequence of str, optional
+        Names to choose from, in place of everything in the folder.
 
     Returns
     -------
@@ -50,11 +60,12 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected the folder with the photos")
-    files = _visible_files(folder)
+    files = list(chosen) if chosen is not None else _visible_files(folder)
     if image_list is None:
-        names = [name for name in files if name.lower().endswith(IMAGE_SUFFIXES)]
+        names = files if chosen is not None else [n for n in files if n.lower().endswith(IMAGE_SUFFIXES)]
         if mask_dir is not None:
             names = _without_masks(names, folder, mask_dir)
+        names = _without_twins(names)
         _warn_of_foreign(files, names)
         where = str(folder)
     else:
@@ -73,10 +84,32 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
         )
     if len(names) < 2:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
+        if videos := [name for name in files if name.lower().endswith(VIDEO_SUFFIXES)]:
+            found += f"; to use a video give it in place of its folder: {folder / videos[0]}"
         raise InputError(
             f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
         )
     return sorted(names)
+
+
+def photos_below(folder: Path) -> list[str]:
+    """Names of the files with one of `IMAGE_SUFFIXES` in a folder and its sub-folders, sorted."""
+    return [name for name in _visible_files(folder) if name.lower().endswith(IMAGE_SUFFIXES)]
+
+
+def _without_twins(names: Sequence[str]) -> list[str]:
+    """The names without HEIC and AVIF files that are there in another format too, as phones export them."""
+    others = {
+        PurePosixPath(name).with_suffix("") for name in names if not name.lower().endswith(CONVERTED_SUFFIXES)
+    }
+    twins = {
+        name
+        for name in names
+        if name.lower().endswith(CONVERTED_SUFFIXES) and PurePosixPath(name).with_suffix("") in others
+    }
+    if twins:
+        logger.info("ignored %s: the same photos are there in another format", _count_suffixes(sorted(twins)))
+    return [name for name in names if name not in twins]
 
 
 def _visible_files(folder: Path) -> list[str]:
@@ -104,7 +137,9 @@ def _warn_of_foreign(files: Sequence[str], names: Sequence[str]) -> None:
         if file.lower().endswith(_FOREIGN_SUFFIXES) and PurePosixPath(file).with_suffix("") not in read
     ]
     if foreign:
-        logger.warning("ignored %s: not readable here; convert them to JPEG first", _count_suffixes(foreign))
+        logger.warning(
+            "ignored %s: not readable here; convert them to JPEG or TIFF first", _count_suffixes(foreign)
+        )
 
 
 def _without_masks(names: Sequence[str], folder: Path, mask_dir: Path) -> list[str]:

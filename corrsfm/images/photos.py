@@ -1,22 +1,32 @@
 """Photos as files: their pixels, their masks, and what EXIF says of camera and position.
 
-Photos are read as stored: an EXIF orientation is not applied, because COLMAP does not either and camera,
-mask and keypoints must use the same frame.
+Photos are read as stored: an EXIF orientation is not applied, because COLMAP does not either (pycolmap 4.2.1
+reads pixels and keypoints as stored, and takes only the direction of gravity from the flag) and camera, mask
+and keypoints must use the same frame. A HEIC photo is turned as its container says, which is part of decoding
+it; no flag is left.
 """
 
 from __future__ import annotations
 
+import io
 import math
+import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.errors import ImageError
+from corrsfm.errors import DependencyError, ImageError
 from corrsfm.images.cameras import PhotoInfo
 
-__all__ = ["read_colour", "read_image", "read_mask", "read_photo_info"]
+__all__ = ["CONVERTED_SUFFIXES", "convert_photo", "read_colour", "read_image", "read_mask", "read_photo_info"]
+
+CONVERTED_SUFFIXES = (".avif", ".heic", ".heif")
+"""Photos that pycolmap does not read."""
+
+_CONVERTED_QUALITY = 97
+_LARGEST_SEGMENT = 65533
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -34,8 +44,13 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     ------
     ImageError
         If the file cannot be read or decoded completely.
+    DependencyError
+        If it is HEIC or AVIF and the extra ``heif`` is not installed.
     """
-    image = _decode(path, "re-export or remove the photo")
+    return _as_bytes(path, _decode(path, "re-export or remove the photo"))
+
+
+def _as_bytes(path: Path, image: NDArray) -> NDArray[np.uint8]:
     if image.dtype == np.uint16:
         shift = max(0, int(image.max()).bit_length() - 8)
         image = (image >> shift).astype(np.uint8)
@@ -73,7 +88,7 @@ def read_mask(path: Path, shape: tuple[int, ...]) -> NDArray[np.bool_]:
 
 
 def read_colour(path: Path) -> NDArray[np.uint8]:
-    """Read a photo in colour, in the orientation in which it is stored.
+    """Read a photo in colour, in the orientation in which it is stored; depths are scaled as in `read_image`.
 
     Returns
     -------
@@ -82,10 +97,11 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
     Raises
     ------
-    ImageError
-        If the file cannot be read or decoded.
+    ImageError, DependencyError
+        As `read_image`.
     """
-    return np.asarray(_decode(path, "re-export or remove the photo", cv2.IMREAD_COLOR), np.uint8)
+    advice = "re-export or remove the photo"
+    return _as_bytes(path, _decode(path, advice, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
 
 
 def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) -> NDArray:
@@ -99,6 +115,9 @@ def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMRE
         raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     if len(content) == 0:
         raise ImageError(f"{path}: the file is empty; {advice}")
+    if path.suffix.lower() in CONVERTED_SUFFIXES:
+        colour, _ = _decode_modern(path, content.tobytes(), advice)
+        return colour if kind & cv2.IMREAD_COLOR else cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)
     try:
         image = cv2.imdecode(content, kind | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error as error:
@@ -108,16 +127,62 @@ def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMRE
     return np.asarray(image)
 
 
+def _decode_modern(path: Path, content: bytes, advice: str) -> tuple[NDArray[np.uint8], bytes]:
+    """Colours (H, W, 3) of a HEIC or AVIF photo, blue first, and its EXIF data, empty if it has none."""
+    try:
+        from PIL import AvifImagePlugin, Image  # noqa: F401
+
+        if path.suffix.lower() != ".avif":
+            from pillow_heif import register_heif_opener
+
+            register_heif_opener()
+    except ImportError as error:
+        raise DependencyError("pillow-heif", f"reading {path}", "heif") from error
+    try:
+        with Image.open(io.BytesIO(content)) as photo:
+            colours = np.asarray(photo.convert("RGB"), np.uint8)
+            exif = photo.info.get("exif") or b""
+    except Image.DecompressionBombError as error:
+        raise ImageError(f"{path}: has too many pixels to be decoded safely; save it smaller") from error
+    except (OSError, ValueError, RuntimeError, SyntaxError) as error:
+        raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}") from error
+    return np.ascontiguousarray(colours[:, :, ::-1]), exif
+
+
+def convert_photo(path: Path, target: Path) -> None:
+    """Write a photo as JPEG with its EXIF data, for programs that do not read its format.
+
+    Raises
+    ------
+    ImageError, DependencyError
+        As `read_image`.
+    """
+    colours, exif = _decode_modern(path, path.read_bytes(), "re-export or remove the photo")
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _CONVERTED_QUALITY]
+    _, encoded = cv2.imencode(".jpg", colours, quality)
+    jpeg = encoded.tobytes()
+    exif = exif if exif.startswith(b"Exif\0\0") else b"Exif\0\0" + exif
+    # An application segment right after the start marker; its length counts its own two bytes.
+    if len(b"Exif\0\0") < len(exif) <= _LARGEST_SEGMENT:
+        jpeg = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    target.write_bytes(jpeg)
+
+
 def read_photo_info(path: Path) -> PhotoInfo:
     """Size, camera and position of a photo.
 
     Raises
     ------
-    ImageError
+    ImageError, DependencyError
         If the photo cannot be read.
     """
     import pycolmap
 
+    if path.suffix.lower() in CONVERTED_SUFFIXES and path.is_file():
+        with tempfile.TemporaryDirectory() as folder:
+            converted = Path(folder) / "photo.jpg"
+            convert_photo(path, converted)
+            return read_photo_info(converted)
     bitmap = pycolmap.Bitmap.read(path, False)
     if bitmap is None:
         # pycolmap does not know the format (WebP), or the file is unreadable.
@@ -128,6 +193,7 @@ def read_photo_info(path: Path) -> PhotoInfo:
         height=int(bitmap.height),
         camera_name=bitmap.exif_camera_model() or None,
         focal_px=bitmap.exif_focal_length() or None,
+        orientation=bitmap.exif_orientation() or 1,
         gps=_position(bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()),
     )
 

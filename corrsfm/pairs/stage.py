@@ -40,9 +40,9 @@ def make_pairs(
     if (source := imported_from(workspace, "pairs")) is not None:
         return _keep_imported(workspace, source, index.names)
     files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
-    fingerprint = config_hash(
-        "pairs", config, run.seed, [[r.name, r.gps] for r in index.records], features.fingerprint, *files
-    )
+    order = ["in the order of time"] if workspace.is_sequence else []
+    photos = [[r.name, r.gps] for r in index.records]
+    fingerprint = config_hash("pairs", config, run.seed, photos, features.fingerprint, *files, *order)
     left_out = photos_left_out(workspace, index.names)
     records = [record for record in index.records if record.name not in left_out]
     if len(records) < 2:
@@ -60,7 +60,10 @@ def make_pairs(
         # A list or a model may name photos that were left out.
         candidates = index.records if files else records
         pair_list = _without(
-            left_out, strategies.make_pairs(candidates, config, load_features=read, seed=run.seed)
+            left_out,
+            strategies.make_pairs(
+                candidates, config, load_features=read, seed=run.seed, is_sequence=workspace.is_sequence
+            ),
         )
     if not len(pair_list):
         raise InputError(

@@ -7,6 +7,7 @@ records which strategies proposed each pair.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 import re
 import shlex
@@ -15,11 +16,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from corrsfm.config import PairsConfig, PairStrategy
 from corrsfm.errors import ConfigError, InputError, first_few
 from corrsfm.files import read_lines
+from corrsfm.geometry import earth_fixed
 from corrsfm.pairs.retrieval import global_vectors, most_similar
 from corrsfm.types import Features, ImageRecord, PairList
 
@@ -28,6 +29,7 @@ __all__ = [
     "exhaustive_pairs",
     "make_pairs",
     "natural_order",
+    "num_pairs_expected",
     "read_pairs_file",
     "retrieval_pairs",
     "sequential_pairs",
@@ -42,8 +44,8 @@ IndexPairs = set[tuple[int, int]]
 MAX_EXHAUSTIVE_PHOTOS = 200
 BLOCK_SIZE = 2048
 LOOP_CLOSURE = "loop-closure"
-# Semi-axes of the WGS84 ellipsoid.
-EQUATOR_M, POLE_M = 6378137.0, 6356752.314245
+# Similar frames paired with each frame of a video; most of them are neighbours in time.
+MAX_LOOPS = 10
 
 
 def make_pairs(
@@ -52,6 +54,7 @@ def make_pairs(
     *,
     load_features: Callable[[str], Features] | None = None,
     seed: int = 0,
+    is_sequence: bool = False,
 ) -> PairList:
     """Choose the pairs to match.
 
@@ -61,11 +64,14 @@ def make_pairs(
         The photos of the scene.
     config : PairsConfig
         ``auto`` means the strategies file and covisibility if there is a pairs file or a model for them, else
-        exhaustive up to 200 photos and retrieval above. With several strategies the result is their union.
+        neighbours in a sequence and its loops, else exhaustive up to 200 photos and retrieval above. With
+        several strategies the result is their union.
     load_features : callable, optional
         Name → features; needed by retrieval and loop closure only.
     seed : int
         Decides which photos the vocabulary of the retrieval is learned from.
+    is_sequence : bool
+        The photos are frames of a video, named in the order of time.
 
     Returns
     -------
@@ -80,6 +86,12 @@ def make_pairs(
         If a pairs file or model does not fit the photos, or no photo has a GPS position.
     """
     names = sorted(record.name for record in records)
+    if (
+        is_sequence
+        and config.pairing == (PairStrategy.AUTO,)
+        and not (config.pairs_file or config.covisible_model)
+    ):
+        config = _of_sequence(config)
     strategies = _resolve(config, len(names))
     retrieved: IndexPairs | None = None
     loop_closure = config.loop_closure and PairStrategy.SEQUENTIAL in strategies
@@ -111,6 +123,24 @@ def make_pairs(
     if loop_closure:
         proposals[LOOP_CLOSURE] = retrieved or set()
     return _merged(names, proposals)
+
+
+def num_pairs_expected(num_photos: int, config: PairsConfig) -> int:
+    """Pairs that ``auto`` makes of photos; an upper bound where they are chosen by similarity."""
+    every = num_photos * (num_photos - 1) // 2
+    few = num_photos <= MAX_EXHAUSTIVE_PHOTOS
+    return every if few else min(every, num_photos * config.num_retrieved)
+
+
+def _of_sequence(config: PairsConfig) -> PairsConfig:
+    """Options for the frames of a video: neighbours in time, near and far, and loops."""
+    return dataclasses.replace(
+        config,
+        pairing=(PairStrategy.SEQUENTIAL,),
+        sequential_quadratic=True,
+        loop_closure=True,
+        num_retrieved=min(config.num_retrieved, MAX_LOOPS),
+    )
 
 
 def _resolve(config: PairsConfig, num_photos: int) -> list[PairStrategy]:
@@ -220,7 +250,7 @@ def spatial_pairs(records: Sequence[ImageRecord], num_neighbours: int, max_dista
             f"{len(located)} of {len(ordered)} photos have a GPS position in EXIF, at least two are needed;"
             " choose another --pairing"
         )
-    points = _earth_fixed(np.array([record.gps[:2] for record in ordered if record.gps is not None]))
+    points = earth_fixed(np.array([(*record.gps[:2], 0.0) for record in ordered if record.gps is not None]))
     pairs = set()
     for start in range(0, len(points), BLOCK_SIZE):
         block = points[start : start + BLOCK_SIZE]
@@ -234,21 +264,6 @@ def spatial_pairs(records: Sequence[ImageRecord], num_neighbours: int, max_dista
         for row, column in np.argwhere(near):
             pairs.add(_ordered(int(located[start + row]), int(located[nearest[row, column]])))
     return pairs
-
-
-def _earth_fixed(positions_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) latitude and longitude in degrees → (N, 3) metres from the centre of the earth."""
-    latitude, longitude = np.radians(positions_deg).T
-    flattened = (POLE_M / EQUATOR_M) ** 2
-    radius = EQUATOR_M / np.sqrt(1 - (1 - flattened) * np.sin(latitude) ** 2)
-    return np.stack(
-        [
-            radius * np.cos(latitude) * np.cos(longitude),
-            radius * np.cos(latitude) * np.sin(longitude),
-            flattened * radius * np.sin(latitude),
-        ],
-        axis=1,
-    )
 
 
 def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:

@@ -35,6 +35,7 @@ from corrsfm.reconstruction.folds.unfold import (
     judge_model,
     try_unfolding,
 )
+from corrsfm.reconstruction.lens import measure_lens_misfit
 from corrsfm.reconstruction.pool import CandidatePool
 from corrsfm.reconstruction.predicted import NeighbourTables, predict, sample_pairs
 from corrsfm.reconstruction.registration import register_again
@@ -342,6 +343,7 @@ def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, fo
             implausible_intrinsics=describe_impossible(model),
             has_prior_focal_lengths=has_prior_focal_lengths(model),
             focal_slack=_focal_slack(model),
+            lens_misfit=measure_lens_misfit(model),
             thickness=thickness(points),
             is_folded=folds.folded,
             conflicts=[f"{pair.name0} – {pair.name1}" for pair in folds.worst(3)] if folds.folded else (),

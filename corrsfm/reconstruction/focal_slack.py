@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
-from corrsfm.reconstruction.calibration import adjust
+from corrsfm.reconstruction.calibration import adjusted_cost, thinned
 from corrsfm.reconstruction.views import views_of
 
 __all__ = ["FocalSlack", "measure_focal_slack"]
@@ -27,8 +27,6 @@ _FACTOR = 1.18
 # from which it is extrapolated.
 _TOLERATED_RISE, _SMALLEST_RISE = 0.05, 0.01
 _MAX_ITERATIONS = 20
-# More points do not change the ratio of two costs, but take time.
-_NUM_POINTS, _NUM_POINTS_PER_PHOTO = 1000, 40
 _MIN_NUM_POINTS = 20
 
 
@@ -71,7 +69,7 @@ def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
     """
     if model.num_reg_images() < 3 or model.num_points3D() < _MIN_NUM_POINTS:
         return None
-    base = _thinned(model)
+    base = thinned(model)
     cost = _cost_of(base, refine_focal_length=True)
     if cost is None or cost <= 0:
         return None
@@ -93,24 +91,9 @@ def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
     return max(found, key=lambda slack: slack.pose_change_deg, default=None)
 
 
-def _thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """A copy with a sample of the points, those of many photos first."""
-    copy = pycolmap.Reconstruction(model)
-    num_kept = max(_NUM_POINTS, _NUM_POINTS_PER_PHOTO * model.num_reg_images())
-    lengths = {point_id: point.track.length() for point_id, point in model.points3D.items()}
-    for point_id in sorted(lengths, key=lambda point_id: (-lengths[point_id], point_id))[num_kept:]:
-        copy.delete_point3D(point_id)
-    return copy
-
-
 def _cost_of(model: pycolmap.Reconstruction, *, refine_focal_length: bool) -> float | None:
     """The cost of a model after adjusting it in place, None if there is nothing to adjust."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal_length
-    options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = _MAX_ITERATIONS
-    summary = adjust(model, options)
-    if not summary.is_solution_usable():
-        return None
-    # The type stubs know the base class of summaries only.
-    return float(summary.ceres_summary.final_cost)  # type: ignore[attr-defined]
+    return adjusted_cost(model, options)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +47,7 @@ def label_of(stage: str) -> str:
     return "kept matches" if stage == "pruned matches" else stage
 
 
-def command_for(stage: str, root: Path, images_dir: str, recorded: Mapping[str, dict[str, Any]]) -> str:
+def command_for(stage: str, root: Path, photos: Sequence[str], recorded: Mapping[str, dict[str, Any]]) -> str:
     """The command that makes a stage, with the options that it was made with, quoted for a shell.
 
     The seed is not recorded with a stage and so not repeated.
@@ -57,15 +57,15 @@ def command_for(stage: str, root: Path, images_dir: str, recorded: Mapping[str, 
     stage : str
     root : Path
         The workspace.
-    images_dir : str
-        The folder of the photos, or a word in its place.
+    photos : sequence of str
+        What the user named as photos, or a word in its place.
     recorded : mapping
         Stage → the options that it was made with, of the stages that finished.
     """
     if "has_shapes" in recorded.get(stage, {}):
         return _import_command(root, images_dir, recorded)
     command = STAGE_COMMANDS[stage]
-    words = ["corrsfm", command, *([images_dir] if command == "extract" else []), str(root)]
+    words = ["corrsfm", command, *(photos if command == "extract" else []), str(root)]
     for name, options in _OPTIONS[command].items():
         if name in recorded:
             words += flags_of(options, recorded[name])

@@ -4,6 +4,8 @@
 
     WORKSPACE/
     ├── workspace.json      format version, image folder, and per stage: fingerprint, options, seconds
+    ├── frames/             frames of a video, and frames.json with their times
+    ├── converted/          JPEGs of HEIC and AVIF photos, and links to the other photos
     ├── images.txt          names of the photos, one per line
     ├── images.json         photos and cameras as corrsfm knows them
     ├── features.h5         keypoints and descriptors
@@ -36,13 +38,13 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import WorkspaceError
-from corrsfm.files import atomic_write_json
+from corrsfm.files import FRAME_TIMES, atomic_write_json
 from corrsfm.workspace.commands import command_for, label_of
 
 __all__ = ["StageRecord", "Workspace"]
@@ -106,6 +108,8 @@ class Workspace:
             )
         self.root = root
         self.manifest = root / "workspace.json"
+        self.frames = root / "frames"
+        self.converted = root / "converted"
         self.images_txt = root / "images.txt"
         self.images_json = root / "images.json"
         self.photo_cache = root / ".photos.json"
@@ -218,12 +222,31 @@ class Workspace:
             raise WorkspaceError(
                 f"{self.root}: no photos indexed yet; run: corrsfm extract IMAGES {self.root}"
             )
-        return Path(self._values["images_dir"])
+        # A folder inside the workspace moves with it.
+        return self.root / self._values["images_dir"]
 
     @images_dir.setter
     def images_dir(self, folder: Path) -> None:
-        self._values["images_dir"] = str(folder.resolve())
+        resolved, root = folder.resolve(), self.root.resolve()
+        inside = resolved in (self.frames.resolve(), self.converted.resolve())
+        self._values["images_dir"] = str(resolved.relative_to(root) if inside else resolved)
         atomic_write_json(self.manifest, self._values)
+
+    @property
+    def given_photos(self) -> tuple[str, ...]:
+        """What the user named as photos, as absolute paths; empty if no photos were indexed yet."""
+        given = self._values.get("given") or [self._values["images_dir"]]
+        return tuple(given) if given[0] else ()
+
+    def remember_photos(self, given: Sequence[str], folder: Path) -> None:
+        """Record what the user named as photos, and the folder where they are."""
+        self._values["given"] = list(given)
+        self.images_dir = folder
+
+    @property
+    def is_sequence(self) -> bool:
+        """Whether the photos are frames of a video, in the order of time."""
+        return (self.images_dir / FRAME_TIMES).is_file()
 
     def record_of(self, stage: str) -> StageRecord | None:
         """The record of a stage, or None if it never finished."""
@@ -279,7 +302,7 @@ class Workspace:
         return command_for(
             stage,
             self.root,
-            images_dir or self._values["images_dir"] or "IMAGES",
+            [images_dir] if images_dir else self.given_photos or ["PHOTOS"],
             {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
         )
 
@@ -329,5 +352,7 @@ def _check_manifest(values: dict[str, Any]) -> None:
     """Check a manifest on loading, so that damage is reported at once."""
     if not isinstance(values["images_dir"], str | None):
         raise TypeError("images_dir is not text")
+    if not all(isinstance(item, str) for item in values.get("given", [])):
+        raise TypeError("given is not a list of texts")
     for record in values["stages"].values():
         StageRecord(**record)

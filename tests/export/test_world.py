@@ -13,6 +13,7 @@ from corrsfm import export_scene
 from corrsfm.errors import InputError
 from corrsfm.export.world import common_up, crop_to_bulk, scale_of, turn_to_z
 from corrsfm.geometry import Pose
+from corrsfm.images.cameras import PhotoInfo
 
 # COLMAP's camera axes of a level camera that looks along +y in a world with z up.
 LEVEL = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -82,6 +83,29 @@ def test_upright_exports_level_cameras(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.camera_to_worlds[:, 2, 0], 0, atol=1e-9)
     np.testing.assert_allclose(read.camera_to_worlds[:, 2, 1], np.cos(np.radians(20)), atol=1e-9)
     np.testing.assert_array_equal(read.applied_transform, np.eye(3, 4))
+
+
+def test_photos_on_their_side_are_upright_by_their_exif(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = leaning_scene(tmp_path / "made")
+    on_side = {"2.png", "4.png"}
+    side = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    for image in scene.model.images.values():
+        if image.name in on_side:  # shown upright after a quarter turn clockwise: flag 6
+            pose = image.cam_from_world()
+            turned = pycolmap.Rotation3d(side @ np.array(pose.rotation.matrix()))
+            image.frame.rig_from_world = pycolmap.Rigid3d(turned, side @ pose.translation)
+    scene.model.write_binary(scene.workspace / "sparse" / "0")
+    monkeypatch.setattr(
+        "corrsfm.export.scene.read_photo_info",
+        lambda path: PhotoInfo(width=1, height=1, orientation=6 if path.name in on_side else 1),
+    )
+    export_scene(scene.workspace, tmp_path / "out", "nerfstudio", upright=True)
+    read = read_nerfstudio(tmp_path / "out")
+    for path, matrix in zip(read.paths, read.camera_to_worlds, strict=True):
+        level = matrix[:3, 1] if path.name in on_side else matrix[:3, 0]
+        assert level[2] == pytest.approx(0, abs=1e-9)
 
 
 def test_two_photos_set_the_scale_and_the_result_leads_back(scene: FinishedScene, tmp_path: Path) -> None:

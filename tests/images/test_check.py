@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from exif import write_jpeg_with_exif
 from numpy.typing import NDArray
 from photos import texture
 
@@ -112,3 +113,38 @@ def test_half_the_light_is_a_stop_and_hashes_count_bits() -> None:
     assert distances[0, 0] == 0 and distances[0, 2] == 256
     assert distances[0, 1] == (bits[0] != bits[1]).sum() == distances[1, 0]
     assert sharp_detail(grey) == 0
+
+
+def test_masks_that_cannot_be_used_stop_a_run(folder: Path, tmp_path: Path) -> None:
+    for name, mask in (
+        ("0.png", np.full((240, 320), 255, np.uint8)),
+        ("1.png", np.full((320, 240), 255, np.uint8)),
+        ("2.png", np.zeros((240, 320), np.uint8)),
+    ):
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        write(tmp_path / "masks" / f"{name}.png", mask)
+    result = check_photos(folder, mask_dir=tmp_path / "masks")
+    finding = next(f for f in result.findings if f.kind == "masks")
+    assert finding.photos == ("1.png", "2.png") and result.stops_a_run
+    assert "1.png.png: the mask has 240×320 pixels, its photo 320×240 as stored" in finding.text
+    (tmp_path / "none").mkdir()
+    lacking = check_photos(folder, mask_dir=tmp_path / "none")
+    assert "no mask for any photo" in next(f for f in lacking.findings if f.kind == "masks").text
+
+
+def test_photos_turned_by_exif_are_named(folder: Path) -> None:
+    write_jpeg_with_exif(folder / "turned.jpg", photo(9), orientation=6)
+    finding = next(f for f in check_photos(folder).findings if f.kind == "rotation")
+    assert finding.photos == ("turned.jpg",) and "used as stored, as COLMAP does" in finding.text
+    assert not check_photos(folder).stops_a_run
+
+
+def test_a_check_of_several_folders_says_what_to_paste(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "more").mkdir()
+    write(tmp_path / "more" / "0.png", cv2.GaussianBlur(photo(13), (0, 0), 4.0))
+    words = ["check", str(folder), str(tmp_path / "more"), "--no-forecast"]
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 0, result.output
+    given = f"{folder} {tmp_path / 'more'}"
+    assert f"corrsfm run {given} scene/ --image-list keep.txt" in result.output
+    assert "forecast" not in result.output.replace("--no-forecast", "")

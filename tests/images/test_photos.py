@@ -99,10 +99,11 @@ def test_photos_in_formats_that_cannot_be_read_are_counted(
 ) -> None:
     list_images(folder)
     assert not caplog.messages
-    for name in ("c.HEIC", "sub/d.heic", "e.cr2", "b.cr2"):  # b.jpg is there as well
+    for name in ("c.CR3", "sub/d.cr3", "e.cr2", "b.cr2"):  # b.jpg is there as well
         (folder / name).write_bytes(b"")
     assert len(list_images(folder)) == 4
-    assert caplog.messages == ["ignored 2 × .heic, 1 × .cr2: not readable here; convert them to JPEG first"]
+    expected = "ignored 2 × .cr3, 1 × .cr2: not readable here; convert them to JPEG or TIFF first"
+    assert caplog.messages == [expected]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse such names themselves")

@@ -33,6 +33,14 @@ def test_the_agreement_of_another_candidate_speaks_for_a_model() -> None:
     assert verdict.reasons[-1] == "another candidate agrees about 90 % of the relative poses"
 
 
+def test_a_good_model_with_a_lens_that_does_not_fit_says_how_to_make_it_exact() -> None:
+    verdict = judge(dataclasses.replace(GOOD, lens_misfit=0.46))
+    assert verdict.grade is Grade.GOOD
+    assert "a richer lens model would take away 46 % of the squared errors" in str(verdict)
+    assert verdict.next_steps == ("--camera-model OPENCV --refine-principal-point for more exact poses",)
+    assert judge(dataclasses.replace(GOOD, lens_misfit=0.2)).next_steps == ()
+
+
 def test_a_photo_in_the_wrong_place_is_named_and_so_are_its_pairs() -> None:
     verdict = judge(evidence_of({**SCENE.views, "2.jpg": bend(SCENE.views["2.jpg"], 15.0)}))
     assert verdict.grade is Grade.DOUBTFUL

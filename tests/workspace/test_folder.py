@@ -57,7 +57,7 @@ def test_a_stage_whose_input_changed_names_the_command_that_redoes_it(workspace:
 
 def test_the_command_to_run_has_the_recorded_options_quoted_for_the_shell(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "my scene", create=True)
-    assert workspace.command_for("features") == f"corrsfm extract IMAGES '{workspace.root}'"
+    assert workspace.command_for("features") == f"corrsfm extract PHOTOS '{workspace.root}'"
     workspace.images_dir = tmp_path / "photos"
     configs = {
         "images": cfg.ImagesConfig(skip_unreadable=True),
