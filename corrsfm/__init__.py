@@ -8,6 +8,7 @@ costs nothing.
     check_photos(photos)                                what to know of photos before a run
     forecast_run(folder, names)                         minutes and disk of a run, by a short measurement
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
+    import_features(photos, workspace, features=…)      bring in features and matches of another tool
     open_workspace(folder)                              read what the stages left there
     export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
     Pruner.load()(pairs)                                prune matches of your own
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from corrsfm.export.scene import ExportResult, export_scene
     from corrsfm.forecast import Forecast, forecast_run
     from corrsfm.images.check import PhotosCheck, check_photos
+    from corrsfm.importing.scene import ImportResult, import_features
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
     from corrsfm.prune.correspondences import correspondences_from_points
@@ -44,6 +46,7 @@ __all__ = [
     "ExportResult",
     "Features",
     "Forecast",
+    "ImportResult",
     "Matches",
     "PhotosCheck",
     "PipelineConfig",
@@ -55,6 +58,7 @@ __all__ = [
     "correspondences_from_points",
     "export_scene",
     "forecast_run",
+    "import_features",
     "load_network",
     "open_workspace",
     "run_scene",
@@ -66,6 +70,7 @@ _HOMES = {
     "ExportResult": "export.scene",
     "Features": "types",
     "Forecast": "forecast",
+    "ImportResult": "importing.scene",
     "Matches": "types",
     "PhotosCheck": "images.check",
     "PipelineConfig": "config",
@@ -76,6 +81,7 @@ _HOMES = {
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
     "forecast_run": "forecast",
+    "import_features": "importing.scene",
     "load_network": "model",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",

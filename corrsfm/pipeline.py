@@ -15,12 +15,14 @@ from typing import Any
 from corrsfm import config as cfg
 from corrsfm.database.stage import verify_matches
 from corrsfm.errors import ReconstructionError
+from corrsfm.features import create_extractor
 from corrsfm.features.stage import extract_features
 from corrsfm.files import atomic_write_json
 from corrsfm.images.sources import Given, whole_folder
 from corrsfm.images.stage import index_photos
 from corrsfm.machine import count_threads, find_device, versions
 from corrsfm.matches.stage import match_pairs
+from corrsfm.model.lightglue import load_package
 from corrsfm.pairs.stage import make_pairs
 from corrsfm.prune import build_pruner, checkpoint_sha256
 from corrsfm.prune.stage import prune_matches
@@ -29,6 +31,7 @@ from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
+from corrsfm.workspace.imported import refuse_foreign_files, traits_of, traits_to_come
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome
 
@@ -74,7 +77,9 @@ def run_scene(
         What the stages raise. If mapping fails, the report is written all the same, because it tells why.
     """
     run = config.run
-    check_options(run, config.prune)
+    check_options(
+        run, config.prune, features=config.features, matches=config.matches, workspace_dir=workspace_dir
+    )
     workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
     with workspace.lock():
         _say(index_photos(workspace, photos, config.images, run, overwrite=overwrite))
@@ -105,7 +110,7 @@ def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, A
         "platform": platform.platform(),
         "seed": config.run.seed,
         "config": cfg.to_dict(config),
-        "checkpoint_sha256": checkpoint_sha256(config.prune),
+        "checkpoint_sha256": checkpoint_sha256(config.prune, traits_of(workspace).features),
         "images_dir": str(workspace.images_dir),
         "images_sha256": {record.name: record.sha256 for record in read_index(workspace).records},
         "seconds": {stage: record.seconds for stage, record in records.items() if record is not None},
@@ -115,22 +120,47 @@ def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, A
     }
 
 
-def check_options(run: cfg.RunConfig, prune: cfg.PruneConfig | None = None) -> None:
-    """Check the device, and the checkpoint of a method, before any work is done.
+def check_options(
+    run: cfg.RunConfig,
+    prune: cfg.PruneConfig | None = None,
+    *,
+    features: cfg.FeaturesConfig | None = None,
+    matches: cfg.MatchesConfig | None = None,
+    workspace_dir: Path | None = None,
+) -> None:
+    """Check the device, the networks and whether the stages fit each other, before any work is done.
 
     Parameters
     ----------
     run : RunConfig
     prune : PruneConfig, optional
         The method that comes later; none if matching is the last stage.
+    features : FeaturesConfig, optional
+    matches : MatchesConfig, optional
+    workspace_dir : Path, optional
+        Imported features and matches in it are kept; it need not exist.
 
     Raises
     ------
     ConfigError
-        If there is no such device.
+        If there is no such device, or an option does not fit the features.
+    DependencyError
+        If a network is not installed.
     CheckpointError
-        If the method needs a checkpoint and it is missing or cannot be read.
+        If the method needs a checkpoint and it is missing, cannot be read or does not fit the features.
+    WorkspaceError
+        If the folder holds features or matches of another tool.
     """
     device = find_device(run.device)
+    features, matches = features or cfg.FeaturesConfig(), matches or cfg.MatchesConfig()
+    known = None
+    if workspace_dir is not None:
+        refuse_foreign_files(workspace_dir)
+        known = Workspace(workspace_dir) if (workspace_dir / "workspace.json").exists() else None
+    traits = traits_to_come(known, features, matches)
+    if features.extractor.kind != cfg.FeatureKind.SIFT:
+        create_extractor(features, device)
+    if matches.matcher == cfg.Matcher.LIGHTGLUE:
+        load_package("--matcher lightglue")
     if prune is not None:
-        build_pruner(prune, device=device, seed=run.seed, threads=count_threads(run.threads))
+        build_pruner(prune, traits=traits, device=device, seed=run.seed, threads=count_threads(run.threads))

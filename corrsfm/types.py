@@ -89,32 +89,35 @@ class Features:
     ----------
     keypoints : (N, 2) float32
         Pixels of the original image, COLMAP convention.
-    scales : (N,) float32
-        Keypoint sizes (standard deviation σ of the SIFT scale) in pixels.
-    orientations : (N,) float32
-        Keypoint orientations in radians, in [-π, π), from the x axis towards the y axis.
+    scales : (N,) float32 or None
+        Keypoint sizes (standard deviation σ of the SIFT scale) in pixels; None if the features have none.
+    orientations : (N,) float32 or None
+        Keypoint orientations in radians, in [-π, π), from the x axis towards the y axis; None likewise.
     scores : (N,) float32
-        What the extractor ranks by (response × scale, or scale); larger is stronger.
-    descriptors : (N, D) uint8
-        Descriptors, quantised the way COLMAP does (unit vector × 512, clipped to 255).
+        What the extractor ranks by (response × scale, or scale); larger is stronger. NaN if nobody said.
+    descriptors : (N, D) uint8 or float32
+        SIFT's, quantised the way COLMAP does (unit vector × 512, clipped to 255), or unit vectors.
     image_size : tuple of int
         Width and height in pixels.
     """
 
     keypoints: NDArray[np.float32]
-    scales: NDArray[np.float32]
-    orientations: NDArray[np.float32]
+    scales: NDArray[np.float32] | None
+    orientations: NDArray[np.float32] | None
     scores: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
+    descriptors: NDArray[np.uint8] | NDArray[np.float32]
     image_size: tuple[int, int]
 
     def __post_init__(self) -> None:
         num = len(self.keypoints)
         _check("keypoints", self.keypoints, (num, 2), np.float32)
-        _check("scales", self.scales, (num,), np.float32)
-        _check("orientations", self.orientations, (num,), np.float32)
+        if self.scales is not None:
+            _check("scales", self.scales, (num,), np.float32)
+        if self.orientations is not None:
+            _check("orientations", self.orientations, (num,), np.float32)
         _check("scores", self.scores, (num,), np.float32)
-        _check("descriptors", self.descriptors, (num, None), np.uint8)
+        floats = self.descriptors.dtype == np.float32
+        _check("descriptors", self.descriptors, (num, None), np.float32 if floats else np.uint8)
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -125,27 +128,35 @@ class Matches:
     """Putative matches of one pair, before any filter; M may be 0.
 
     One match for every keypoint of image 0 that has a nearest neighbour in image 1, ordered by the index in
-    image 0, so that every later filter can be tried without matching again.
+    image 0, so that every later filter can be tried without matching again. A learned matcher, or another
+    tool, leaves fewer.
 
     Attributes
     ----------
     indices : (M, 2) int32
         Keypoint indices in image 0 and image 1; column 0 strictly increases.
     ratios : (M,) float32
-        Distance to the nearest over distance to the second nearest descriptor, in [0, 1].
+        Distance to the nearest over distance to the second nearest descriptor, in [0, 1]; NaN where
+        ``scores`` stand in their place.
     mutual : (M,) bool
         True where the match is also the nearest neighbour from image 1 to image 0.
+    scores : (M,) float32 or None
+        Confidence of a matcher that compares more than descriptors, or of another tool; larger is surer.
+        None for nearest neighbours.
     """
 
     indices: NDArray[np.int32]
     ratios: NDArray[np.float32]
     mutual: NDArray[np.bool_]
+    scores: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         num = len(self.indices)
         _check("indices", self.indices, (num, 2), np.int32)
         _check("ratios", self.ratios, (num,), np.float32)
         _check("mutual", self.mutual, (num,), np.bool_)
+        if self.scores is not None:
+            _check("scores", self.scores, (num,), np.float32)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -185,19 +196,23 @@ class Correspondences:
     normalised : (M, 4) float32
         ``x0 y0 x1 y1`` normalised by the intrinsics known before reconstruction.
     ratios : (M,) float32
-        Ratio of the two nearest descriptor distances.
+        Ratio of the two nearest descriptor distances; NaN for matches that have ``scores`` instead.
     mutual : (M,) bool
         Mutual nearest neighbours.
     log_scale_ratios : (M,) float32
-        Natural logarithm of scale in image 1 over scale in image 0.
+        Natural logarithm of scale in image 1 over scale in image 0; NaN for features without scale.
     rotations : (M,) float32
-        Orientation in image 1 minus orientation in image 0, radians, wrapped to [-π, π).
+        Orientation in image 1 minus orientation in image 0, radians, wrapped to [-π, π); NaN likewise.
     camera0, camera1 : Camera
         The cameras that ``normalised`` was made with.
     name : str
         ``"name0 – name1"`` for messages.
     mutual_known : bool
         False if ``mutual`` only stands in for what nobody said.
+    scores : (M,) float32 or None
+        See `Matches`.
+    shapes_known : bool
+        False if the features have no scale and orientation.
     """
 
     points0: NDArray[np.float32]
@@ -211,6 +226,8 @@ class Correspondences:
     camera1: Camera
     name: str = ""
     mutual_known: bool = True
+    scores: NDArray[np.float32] | None = None
+    shapes_known: bool = True
 
     def __post_init__(self) -> None:
         num = len(self.points0)
@@ -221,6 +238,8 @@ class Correspondences:
         _check("mutual", self.mutual, (num,), np.bool_)
         _check("log_scale_ratios", self.log_scale_ratios, (num,), np.float32)
         _check("rotations", self.rotations, (num,), np.float32)
+        if self.scores is not None:
+            _check("scores", self.scores, (num,), np.float32)
 
     def __len__(self) -> int:
         return len(self.points0)

@@ -1,11 +1,15 @@
 """Fixtures shared by all tests."""
 
-# cv2 must be loaded before pycolmap, see test_architecture.py.
 import os
 from pathlib import Path
 
-import cv2  # noqa: F401
-import pytest
+# Threads of one small operation wait for each other in a loop: beside other work on the machine, tests of
+# networks would take ten times as long. Read by torch when it is first imported.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# cv2 must be loaded before pycolmap, see test_architecture.py.
+import cv2  # noqa: E402, F401
+import pytest  # noqa: E402
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

@@ -19,13 +19,16 @@ STAGES = ("images", "features", "pairs", "matches", "prune", "database", "recons
 FLOORS: list[tuple[str, set[str]]] = [
     (
         "what everything may use",
-        {"corrsfm", "errors", "camera", "types", "geometry", "graph", "files", "machine"},
+        {"corrsfm", "errors", "camera", "types", "geometry", "descriptors", "graph", "files", "machine"},
     ),
     ("the options", {"config"}),
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
-    ("a whole run, its forecast, and what is handed on after it", {"pipeline", "forecast", "export"}),
+    (
+        "a whole run, its forecast, and what comes in before and is handed on after it",
+        {"pipeline", "forecast", "importing", "export"},
+    ),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
 ]
@@ -46,12 +49,12 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
 # The rooms that may import a third-party package.
 OWNERS: dict[str, set[str]] = {
     "cv2": {"images", "features", "report", "prune", "evaluation"},
-    "h5py": {"workspace", "labelled", "export"},
+    "h5py": {"workspace", "labelled", "importing", "export"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
         "export", "evaluation",
     },
-    "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
+    "torch": {"model", "machine", "features", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},
     "tqdm": {"cli", "workspace", "images.stage", "reconstruction.stage", "batch", "training", "evaluation"},
     "plotly": {"report", "evaluation"},

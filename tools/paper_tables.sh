@@ -9,7 +9,8 @@
 #
 # The HDF5 files are the ones the public tools of OANet make (4,000 pairs of unknown scenes of YFCC100M, 14,872
 # of SUN3D). Results go to results/paper_*.json; what they hold already is not measured again, so a run that was
-# stopped goes on where it was.
+# stopped goes on where it was. A checkpoint of another network is given as NAME:FILE, such as
+# clnet:pretrained_models/clnet_yfcc_sift.pth.
 #
 # Read the output with care:
 #  - The paper's numbers are the network's own essential matrix ("w8pt"), thresholds 5, 10 and 20 degrees, exact
@@ -31,12 +32,16 @@ classical=(
 )
 
 learned=()
+filters=()
 for checkpoint in "$@"; do
+  network=corradaptor file=$checkpoint
+  if [[ $checkpoint =~ ^[a-z0-9]+: ]]; then network=${checkpoint%%:*} file=${checkpoint#*:}; fi
   learned+=(
-    --method "corradaptor@pose:$checkpoint/w8pt"
-    --method "corradaptor@pose:$checkpoint/ransac"
-    --method "corradaptor@sfm:$checkpoint/poselib"
+    --method "$network@pose:$file/w8pt"
+    --method "$network@pose:$file/ransac"
+    --method "$network@sfm:$file/poselib"
   )
+  filters+=(--filter "$network@pose:$file")
 done
 
 paper() { printf '\nThe paper says:\n\n%s\n' "$1"; }
@@ -70,8 +75,6 @@ sun3d)
 | CorrAdaptor | 9.33 | 22.66 | 40.85 |'
   ;;
 hpatches)
-  filters=()
-  for checkpoint in "$@"; do filters+=(--filter "corradaptor@pose:$checkpoint"); done
   corrsfm evaluate homography "$data" --filter nn --filter mutual --filter ratio0.8+mutual "${filters[@]}" \
     --results results/paper_hpatches.json
   paper '| HPatches | AUC@3 | AUC@5 | AUC@10 |

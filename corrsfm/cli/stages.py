@@ -75,14 +75,14 @@ def extract(
     """Index photos, extract features, match.
 
     PHOTOS is a folder, a video, or any of several folders, photos, lists of photos (.txt) and quoted
-    patterns. Lists the photos and their cameras, extracts SIFT features, chooses pairs and finds the nearest
-    neighbour of every keypoint, with its distance ratio and a mutual flag.
+    patterns. Lists the photos and their cameras, extracts SIFT features or those of a network, chooses pairs
+    and finds the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm import pipeline
     from corrsfm.images.sources import whole_folder
     from corrsfm.workspace import Workspace
 
-    pipeline.check_options(run)
+    pipeline.check_options(run, features=features, matches=matches, workspace_dir=workspace_dir)
     workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
     with workspace.lock():
         outcomes = [

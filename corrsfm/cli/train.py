@@ -102,7 +102,7 @@ def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsag
     from corrsfm.model import load_network, read_provenance, save_network
 
     checkpoint = source / "latest.pt" if source.is_dir() else source
-    network = load_network(checkpoint, architecture="corradaptor")
+    network = load_network(checkpoint)
     network.usage = adjust(network.usage)
     digest = save_network(network, output, provenance=read_provenance(checkpoint), half=half)
     click.echo(f"{output}  sha256 {digest}")

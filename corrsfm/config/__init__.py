@@ -7,7 +7,9 @@ from corrsfm.config.stages import (
     Extractor,
     FeaturesConfig,
     ImagesConfig,
+    ImportedConfig,
     Mapper,
+    Matcher,
     MatchesConfig,
     OperatingPoint,
     PairsConfig,
@@ -20,17 +22,28 @@ from corrsfm.config.stages import (
     RunConfig,
     load_pipeline,
 )
-from corrsfm.config.usage import MatchInput, NetworkUsage
+from corrsfm.config.usage import (
+    LIGHTGLUE_KINDS,
+    FeatureKind,
+    MatchInput,
+    MatchTraits,
+    NetworkUsage,
+)
 
 __all__ = [
     "LARGEST_INT",
+    "LIGHTGLUE_KINDS",
     "CameraMode",
     "DatabaseConfig",
     "Extractor",
+    "FeatureKind",
     "FeaturesConfig",
     "ImagesConfig",
+    "ImportedConfig",
     "Mapper",
     "MatchInput",
+    "MatchTraits",
+    "Matcher",
     "MatchesConfig",
     "NetworkUsage",
     "OperatingPoint",

@@ -12,6 +12,7 @@ from enum import StrEnum
 from pathlib import Path
 
 from corrsfm.config.fields import LARGEST_INT, from_dict, load_toml, option
+from corrsfm.config.usage import FeatureKind
 
 __all__ = [
     "CameraMode",
@@ -19,7 +20,9 @@ __all__ = [
     "Extractor",
     "FeaturesConfig",
     "ImagesConfig",
+    "ImportedConfig",
     "Mapper",
+    "Matcher",
     "MatchesConfig",
     "OperatingPoint",
     "PairStrategy",
@@ -44,10 +47,26 @@ class CameraMode(StrEnum):
 
 
 class Extractor(StrEnum):
-    """Implementations of SIFT."""
+    """What finds and describes keypoints: two implementations of SIFT, and networks."""
 
     OPENCV = "opencv"
     PYCOLMAP = "pycolmap"
+    ALIKED = "aliked"
+    DISK = "disk"
+    SUPERPOINT = "superpoint"
+
+    @property
+    def kind(self) -> FeatureKind:
+        """What its features are."""
+        sift = self in (Extractor.OPENCV, Extractor.PYCOLMAP)
+        return FeatureKind.SIFT if sift else FeatureKind(self.value)
+
+
+class Matcher(StrEnum):
+    """Ways to find putative matches."""
+
+    NEAREST = "nearest"
+    LIGHTGLUE = "lightglue"
 
 
 class PairStrategy(StrEnum):
@@ -63,7 +82,7 @@ class PairStrategy(StrEnum):
 
 
 class PruneMethod(StrEnum):
-    """Ways to prune putative matches."""
+    """Ways to prune putative matches: none, classical ones, and networks."""
 
     NONE = "none"
     RATIO = "ratio"
@@ -71,6 +90,23 @@ class PruneMethod(StrEnum):
     MAGSAC = "magsac"
     CORRADAPTOR = "corradaptor"
     CASCADE = "cascade"
+    POINTCN = "pointcn"
+    OANET = "oanet"
+    LMCNET = "lmcnet"
+    MS2DGNET = "ms2dgnet"
+    CLNET = "clnet"
+    PGFNET = "pgfnet"
+    CONVMATCH = "convmatch"
+    NCMNET = "ncmnet"
+    MGNET = "mgnet"
+    UMATCH = "umatch"
+
+    @property
+    def architecture(self) -> str | None:
+        """The network that it asks, as `corrsfm.model.load_network` calls it; None if it asks none."""
+        if self in (PruneMethod.NONE, PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC):
+            return None
+        return str(PruneMethod.CORRADAPTOR if self is PruneMethod.CASCADE else self)
 
 
 class OperatingPoint(StrEnum):
@@ -123,16 +159,42 @@ class ImagesConfig:
     )
 
 
+_SIFT = ("extractor", (Extractor.OPENCV, Extractor.PYCOLMAP))
+_SUPERPOINT = ("extractor", (Extractor.SUPERPOINT,))
+
+
 @dataclass(frozen=True, kw_only=True)
 class FeaturesConfig:
-    """SIFT extraction."""
+    """Keypoints and descriptors."""
 
-    extractor: Extractor = option(Extractor.OPENCV, "Which SIFT")
+    extractor: Extractor = option(
+        Extractor.OPENCV,
+        "SIFT by OpenCV or pycolmap, or a network: aliked and disk need the extra learned-features, "
+        "superpoint weights of yours",
+    )
     max_features: int = option(4096, "Keypoints kept per photo, strongest first", minimum=1)
     max_image_size: int = option(
         1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
     )
-    root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)")
+    root_sift: bool = option(True, "Hellinger-normalise descriptors (RootSIFT)", used_with=_SIFT)
+    # The checksum of the file is part of what decides about equal features, not its path.
+    superpoint_weights: Path | None = option(
+        None,
+        "SuperPoint's published state dict, such as superpoint_v1.pth",
+        affects_result=False,
+        used_with=_SUPERPOINT,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedConfig:
+    """Features or matches of another tool, in place of the options of the stage that makes them."""
+
+    features: Path | None = option(None, "File of hloc that the features came from")
+    matches: Path | None = option(None, "File of hloc that the matches came from")
+    database: Path | None = option(None, "COLMAP database that both came from")
+    kind: FeatureKind = option(FeatureKind.OTHER, "What the features are")
+    has_shapes: bool = option(False, "Whether keypoints came with scale and orientation")
 
 
 _SEQUENTIAL = ("pairing", (PairStrategy.SEQUENTIAL, PairStrategy.AUTO))
@@ -174,14 +236,19 @@ class PairsConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchesConfig:
-    """Nearest-neighbour matching of descriptors."""
+    """Putative matches."""
 
+    matcher: Matcher = option(
+        Matcher.NEAREST,
+        "Nearest neighbours of descriptors, or LightGlue, which needs the extra learned-features and the "
+        "features of aliked or disk",
+    )
     block_size: int = option(
         4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
     )
 
 
-_NETWORK = ("method", (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE))
+_NETWORK = ("method", tuple(method for method in PruneMethod if method.architecture))
 _ESTIMATOR = ("method", (PruneMethod.LORANSAC, PruneMethod.MAGSAC))
 _RATIO = ("method", (PruneMethod.RATIO, PruneMethod.LORANSAC, PruneMethod.MAGSAC, PruneMethod.CASCADE))
 
@@ -193,16 +260,24 @@ class PruneConfig:
     # The best on the validation scenes, see results/pose_val_scenes.json.
     method: PruneMethod = option(
         PruneMethod.CORRADAPTOR,
-        "How putative matches are pruned; all but corradaptor and cascade need no network",
+        "How putative matches are pruned: none to magsac without a network, corradaptor and cascade with the "
+        "bundled one, all others with a network of yours (--model)",
     )
-    model: Path | None = option(None, "Network checkpoint; the bundled one if not given", used_with=_NETWORK)
+    model: Path | None = option(
+        None, "Network checkpoint; if not given the bundled one for the features", used_with=_NETWORK
+    )
     operating_point: OperatingPoint = option(
         OperatingPoint.SFM,
         "sfm keeps what mapping can use; pose is strict, for two-view poses",
         used_with=_NETWORK,
     )
-    max_ratio: float = option(
-        0.8, "Largest descriptor distance ratio of the ratio test", above=0, used_with=_RATIO
+    # On validation pairs with ALIKED every ratio up to 0.95 lost poses against none, see docs/guide.md.
+    max_ratio: float | None = option(
+        None,
+        "Largest descriptor distance ratio of the ratio test; if not given 0.8 for SIFT, and mutual matches "
+        "without a ratio test for other features",
+        above=0,
+        used_with=_RATIO,
     )
     max_error_px: float = option(
         4.0, "Inlier threshold of the robust estimators", unit="px", above=0, used_with=_ESTIMATOR

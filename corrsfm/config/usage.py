@@ -7,7 +7,40 @@ from enum import StrEnum
 
 from corrsfm.config.fields import option
 
-__all__ = ["MatchInput", "NetworkUsage"]
+__all__ = ["LIGHTGLUE_KINDS", "FeatureKind", "MatchInput", "MatchTraits", "NetworkUsage"]
+
+
+class FeatureKind(StrEnum):
+    """What keypoints and descriptors are, whoever made them."""
+
+    SIFT = "sift"
+    ALIKED = "aliked"
+    DISK = "disk"
+    SUPERPOINT = "superpoint"
+    OTHER = "other"
+
+
+LIGHTGLUE_KINDS = (FeatureKind.ALIKED, FeatureKind.DISK)
+"""Features that LightGlue's package has weights for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MatchTraits:
+    """What the putative matches of a scene carry.
+
+    Attributes
+    ----------
+    features : FeatureKind
+        What they match.
+    has_shapes : bool
+        Whether keypoints have scale and orientation.
+    has_ratios : bool
+        Whether matches have the ratio of the two nearest descriptor distances.
+    """
+
+    features: FeatureKind = FeatureKind.SIFT
+    has_shapes: bool = True
+    has_ratios: bool = True
 
 
 class MatchInput(StrEnum):
@@ -24,6 +57,9 @@ class NetworkUsage:
     The defaults are those of the first bundled checkpoint, and of every file that says nothing.
     """
 
+    features: FeatureKind = option(
+        FeatureKind.SIFT, "Features whose matches the network was trained on", affects_result=False
+    )
     input: MatchInput = option(
         MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
     )

@@ -149,13 +149,21 @@ def _write_features(
 ) -> None:
     if not np.isfinite(features.keypoints).all():
         raise InputError(f"{name}: a keypoint is not a finite number; extract its features again")
-    keypoints = np.column_stack([features.keypoints, features.scales, features.orientations])
+    keypoints = features.keypoints
+    if features.scales is not None and features.orientations is not None:
+        keypoints = np.column_stack([keypoints, features.scales, features.orientations])
     database.write_keypoints(image_id, np.ascontiguousarray(keypoints, np.float32))
-    if write_descriptors:
-        database.write_descriptors(
-            image_id,
-            pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=features.descriptors),
-        )
+    if write_descriptors and features.descriptors.shape[1]:
+        database.write_descriptors(image_id, _colmap_descriptors(features.descriptors))
+
+
+def _colmap_descriptors(descriptors: NDArray) -> pycolmap.FeatureDescriptors:
+    """COLMAP's record of descriptors: the bytes of floats for all but SIFT, of no kind that it knows."""
+    kinds = pycolmap.FeatureExtractorType
+    if descriptors.dtype == np.uint8:
+        return pycolmap.FeatureDescriptors(type=kinds.SIFT, data=descriptors)
+    floats = np.ascontiguousarray(descriptors, np.float32).view(np.uint8)
+    return pycolmap.FeatureDescriptors(type=kinds.UNDEFINED, data=floats)
 
 
 def _write_pairs(

@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from corrsfm.config import Precision
-from corrsfm.model import CorrAdaptor, NetworkConfig, load_network
+from corrsfm.model import CorrAdaptor, NetworkConfig, Rival, load_network
 from corrsfm.model.plain import PlainCorrAdaptor
 
 __all__ = ["BenchmarkRow", "format_rows", "run_benchmark"]
@@ -76,7 +76,7 @@ def run_benchmark(
     Parameters
     ----------
     model : Path, optional
-        Checkpoint. If not given, the published architecture with fresh weights, which is as fast.
+        Checkpoint of any network. If not given, CorrAdaptor as published with fresh weights, which is as fast.
     devices : sequence of str
     sizes : sequence of int
         Matches a pair.
@@ -94,10 +94,8 @@ def run_benchmark(
     list of BenchmarkRow
         Grouped by device, size and batch size; the reference first in each group.
     """
-    network = (
-        load_network(model, architecture="corradaptor")
-        if model is not None
-        else CorrAdaptor.from_config(NetworkConfig()).eval()
+    network: CorrAdaptor | Rival = (
+        load_network(model) if model is not None else CorrAdaptor.from_config(NetworkConfig()).eval()
     )
     reference = PlainCorrAdaptor().eval()
     rows: list[BenchmarkRow] = []
@@ -116,7 +114,7 @@ def run_benchmark(
 
 def _variants(
     reference: PlainCorrAdaptor,
-    network: CorrAdaptor,
+    network: CorrAdaptor | Rival,
     precisions: Sequence[Precision],
     compile: bool,
     device: torch.device,

@@ -27,7 +27,14 @@ from corrsfm.config import Extractor, FeaturesConfig
 from corrsfm.geometry import wrap_angles
 from corrsfm.types import Features
 
-__all__ = ["algorithm_of", "create_extractor", "extract_features", "quantise_descriptors", "scaled_size"]
+__all__ = [
+    "algorithm_of",
+    "create_extractor",
+    "extract_features",
+    "inside_mask",
+    "quantise_descriptors",
+    "scaled_size",
+]
 
 # OpenCV divides its threshold by the three layers of an octave. The value is far below its default of 0.04
 # so that photos of low texture reach `max_features` too; keeping the strongest does the selection.
@@ -163,7 +170,7 @@ def _detect_opencv(
     geometry = _opencv_geometry(found)
     scores = np.array([keypoint.response for keypoint in found]) * geometry[:, 2]
     if mask is not None:
-        scores = np.where(_inside_mask(geometry[:, :2] * factors, mask), scores, -np.inf)
+        scores = np.where(inside_mask(geometry[:, :2] * factors, mask), scores, -np.inf)
     chosen = _strongest_first(geometry, scores)[:max_features]
     chosen = chosen[np.isfinite(scores[chosen])]
     if len(chosen) == 0:
@@ -212,7 +219,7 @@ def _detect_pycolmap(
     ).reshape(-1, 4)
     descriptors = np.asarray(raw.data, np.uint8).reshape(len(geometry), DESCRIPTOR_SIZE)
     if mask is not None:
-        inside = _inside_mask(geometry[:, :2] * factors, mask)
+        inside = inside_mask(geometry[:, :2] * factors, mask)
         geometry, descriptors = geometry[inside], descriptors[inside]
     return geometry, geometry[:, 2].copy(), descriptors
 
@@ -222,7 +229,7 @@ def _strongest_first(geometry: NDArray[np.float64], scores: NDArray[np.float64])
     return np.lexsort((geometry[:, 3], geometry[:, 2], geometry[:, 1], geometry[:, 0], -scores))
 
 
-def _inside_mask(points: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def inside_mask(points: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(N,) bool: whether the pixel under each point of the original image may be used."""
     height, width = mask.shape
     columns = np.clip(np.floor(points[:, 0]).astype(np.int64), 0, width - 1)

@@ -13,12 +13,13 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
 from corrsfm.errors import ImageError
-from corrsfm.features.sift import algorithm_of, create_extractor
-from corrsfm.images.photos import read_image, read_mask
-from corrsfm.machine import count_threads, threaded
+from corrsfm.features import algorithm_of, create_extractor, reads_colour
+from corrsfm.images.photos import read_colour, read_image, read_mask
+from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.imported import imported_features, imported_from, refuse_foreign
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
 from corrsfm.workspace.store import ItemStore
@@ -39,32 +40,54 @@ def extract_features(
     ------
     ImageError
         Naming every photo that cannot be read; the features of the others are kept.
+    WorkspaceError
+        If the features were imported and a photo has none.
     """
     index = read_index(workspace)
     images = workspace.require("images")
-    algorithm = algorithm_of(config.extractor)
+    store = ItemStore(workspace.features, FEATURES)
+    refuse_foreign(workspace.features, FEATURES)
+    if (source := imported_from(workspace, "features")) is not None:
+        return complete(
+            workspace,
+            "features",
+            store,
+            imported_features(workspace),
+            lambda missing: [],
+            source,
+            inputs={"images": images.fingerprint},
+            overwrite=False,
+            unit="photo",
+        )
+    algorithm = algorithm_of(config)
     wanted = {
         record.name: config_hash(algorithm, record.sha256, record.mask_sha256 or "", config)
         for record in index.records
     }
     of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
-    store = ItemStore(workspace.features, FEATURES)
     records = {record.name: record for record in index.records}
-    extract = create_extractor(config)
+    device = find_device(run.device) if config.extractor.kind != cfg.FeatureKind.SIFT else "cpu"
+    extract = create_extractor(config, device)
+    read = read_colour if reads_colour(config.extractor) else read_image
     mask_dir = images.config.get("mask_dir")
     unreadable: list[str] = []
 
     def work(name: str) -> Features | ImageError:
         record = records[name]
         try:
-            image = read_image(workspace.images_dir / name)
+            image = read(workspace.images_dir / name)
             mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
             return extract(image, mask)
         except ImageError as error:
             return error
 
+    # On a CPU each photo takes one thread, on a GPU one photo goes at a time.
+    num_at_once = count_threads(run.threads) if device == "cpu" else 1
+    if config.extractor.kind != cfg.FeatureKind.SIFT:
+        use_threads(1)
+
     def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
-        for name, result in threaded(work, missing, count_threads(run.threads)):
+        for name, result in threaded(work, missing, num_at_once):
             if isinstance(result, Features):
                 yield name, result
             elif images.config.get("skip_unreadable"):
@@ -102,8 +125,8 @@ def extract_features(
 def _no_features(index: Index, record: ImageRecord) -> Features:
     """Empty features for a photo that was left out."""
     camera = index.camera_of(record)
-    none = np.zeros(0, np.float32)
     return Features(
-        keypoints=np.zeros((0, 2), np.float32), scales=none, orientations=none, scores=none,
-        descriptors=np.zeros((0, 128), np.uint8), image_size=(camera.width, camera.height),
+        keypoints=np.zeros((0, 2), np.float32), scales=None, orientations=None,
+        scores=np.zeros(0, np.float32), descriptors=np.zeros((0, 128), np.uint8),
+        image_size=(camera.width, camera.height),
     )  # fmt: skip

@@ -15,8 +15,9 @@ translations        (I, 3) float64      cam_from_world
 keypoint_offsets    (I+1,) int64        rows of each photo in the next four
 keypoints           (K, 2) uint16       pixels (COLMAP convention) in units of the longest side / 65535
 corrections         (K, 2) float16      undistorted minus pinhole normalised coordinates
-log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels
-orientations        (K,) uint16         orientation in units of a turn / 65536
+log_scales          (K,) float16        natural logarithm of the keypoint's scale in pixels; NaN for none
+orientations        (K,) uint16         orientation in units of a turn / 65536; without meaning where
+                                        log_scales is NaN
 pairs               (P, 2) uint16       photo indices
 covisible           (P,) int32          shared points of the reconstruction; 0 marks a negative: two places,
                                         all matches wrong
@@ -83,8 +84,9 @@ class CompactScene:
     corrections : (K, 2) float32
         Undistorted minus pinhole normalised coordinates.
     log_scales : (K,) float32
+        NaN for features without scale and orientation.
     orientations : (K,) float32
-        Radians in [-π, π).
+        Radians in [-π, π); NaN likewise.
     pairs : (P, 2) int64
     covisible : (P,) int64
     match_offsets : (P+1,) int64
@@ -181,7 +183,7 @@ def _encode(scene: CompactScene) -> dict[str, NDArray]:
     for row, camera in zip(params, scene.cameras, strict=True):
         row[: len(camera.params)] = camera.params
     longest = np.repeat(sizes.max(axis=1, initial=1), np.diff(scene.keypoint_offsets))
-    turns = np.round(scene.orientations / (2.0 * np.pi) * 65536.0).astype(np.int64)
+    turns = np.round(np.nan_to_num(scene.orientations) / (2.0 * np.pi) * 65536.0).astype(np.int64)
     return {
         "image_sizes": sizes,
         "camera_params": params,
@@ -241,6 +243,9 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
     )
     longest = np.repeat(sizes.max(axis=1, initial=1), np.diff(offsets))
     num_matches = len(stored["neighbours"])
+    log_scales = stored["log_scales"].astype(np.float32)
+    # The cast to a signed integer puts the angle in [-π, π).
+    angles = (stored["orientations"].astype(np.int16) * (2.0 * np.pi / 65536.0)).astype(np.float32)
     return CompactScene(
         name=name,
         image_names=tuple(group["image_names"].asstr()[()]),
@@ -250,9 +255,8 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
         keypoint_offsets=offsets,
         keypoints=(stored["keypoints"] * (longest[:, None] / 65535.0)).astype(np.float32),
         corrections=stored["corrections"].astype(np.float32),
-        log_scales=stored["log_scales"].astype(np.float32),
-        # The cast to a signed integer puts the angle in [-π, π).
-        orientations=(stored["orientations"].astype(np.int16) * (2.0 * np.pi / 65536.0)).astype(np.float32),
+        log_scales=log_scales,
+        orientations=np.where(np.isnan(log_scales), np.float32(np.nan), angles),
         pairs=stored["pairs"].astype(np.int64),
         covisible=stored["covisible"].astype(np.int64),
         match_offsets=stored["match_offsets"],

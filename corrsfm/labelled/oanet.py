@@ -123,6 +123,7 @@ class OANetPair:
             mutual=self.mutual,
             log_scale_ratios=self.log_scale_ratios,
             rotations=self.rotations,
+            shapes_known=not (len(self) and np.isnan(self.log_scale_ratios).all()),
             camera0=self.camera0,
             camera1=self.camera1,
             name=self.name,

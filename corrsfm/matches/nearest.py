@@ -1,9 +1,9 @@
 """Descriptors of two photos → putative matches: nearest neighbours by blocked matrix products.
 
-Descriptors are bytes, so all products and sums that make a squared distance are integers. With D ≤ 128 they
-stay below 2²⁴ and float32 holds them exactly: the result does not depend on block size, number of threads or
-device, and equal distances compare equal. (bfloat16 and float16 could hold the bytes, but not the sums.)
-Among equal distances the lowest keypoint index wins.
+Descriptors are whole numbers (`corrsfm.descriptors`: bytes, or unit vectors in small steps), so all products
+and sums that make a squared distance are integers that float32 holds exactly: the result does not depend on
+block size, number of threads or device, and equal distances compare equal. (bfloat16 and float16 could hold
+the bytes, but not the sums.) Among equal distances the lowest keypoint index wins.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import MatchesConfig
+from corrsfm.descriptors import as_integers
 from corrsfm.types import Matches
 
 __all__ = ["Matcher", "match_features"]
 
 # Rows compared at a time on a CPU: the block then stays in the cache between its reductions.
 CPU_BLOCK_ROWS = 256
-MAX_EXACT_FLOAT32_SIZE = 128
 
 
 def match_features(
-    descriptors0: NDArray[np.uint8],
-    descriptors1: NDArray[np.uint8],
+    descriptors0: NDArray,
+    descriptors1: NDArray,
     *,
     block_size: int = MatchesConfig.block_size,
     device: str = "cpu",
@@ -37,8 +37,9 @@ def match_features(
 
     Parameters
     ----------
-    descriptors0 : (N0, D) uint8
-    descriptors1 : (N1, D) uint8
+    descriptors0 : (N0, D) uint8 or float32
+        Bytes, or unit vectors.
+    descriptors1 : (N1, D) uint8 or float32
     block_size : int
         Descriptors of either image compared at a time; the memory is proportional to its square.
     device : str
@@ -60,7 +61,7 @@ class Matcher:
     Parameters
     ----------
     load : callable
-        Image name → (N, D) uint8 descriptors.
+        Image name → (N, D) descriptors.
     device : str
         A torch device.
     block_size : int
@@ -72,7 +73,7 @@ class Matcher:
 
     def __init__(
         self,
-        load: Callable[[str], NDArray[np.uint8]],
+        load: Callable[[str], NDArray],
         *,
         device: str = "cpu",
         block_size: int = MatchesConfig.block_size,
@@ -102,10 +103,8 @@ class Matcher:
 class _Prepared:
     """Descriptors of one image on the device."""
 
-    def __init__(self, descriptors: NDArray[np.uint8], device: torch.device) -> None:
-        exact = descriptors.shape[1] <= MAX_EXACT_FLOAT32_SIZE
-        values = torch.from_numpy(np.ascontiguousarray(descriptors)).to(device)
-        self.values = values.to(torch.float32 if exact else torch.float64)  # (N, D)
+    def __init__(self, descriptors: NDArray, device: torch.device) -> None:
+        self.values = torch.from_numpy(np.ascontiguousarray(as_integers(descriptors))).to(device)  # (N, D)
         self.squared = self.values.square().sum(dim=1)  # (N,)
 
     def __len__(self) -> int:

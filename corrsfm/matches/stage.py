@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from corrsfm import config as cfg
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
+from corrsfm.matches.lightglue import LightGlueMatcher
 from corrsfm.matches.nearest import Matcher
 from corrsfm.types import Matches, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES
+from corrsfm.workspace.imported import imported_from, imported_matches, traits_of
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
@@ -21,31 +23,49 @@ __all__ = ["match_pairs"]
 def match_pairs(
     workspace: Workspace, config: cfg.MatchesConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
-    """Find the putative matches of every pair."""
+    """Find the putative matches of every pair.
+
+    Raises
+    ------
+    ConfigError
+        If the matcher does not know the features, or is not installed.
+    """
     features = workspace.require("features")
     pairs = workspace.require("pairs")
-    store = ItemStore(workspace.features, FEATURES)
-    wanted = wanted_matches(workspace)
+    store = ItemStore(workspace.matches, MATCHES)
+    inputs = {"features": features.fingerprint, "pairs": pairs.fingerprint}
+    if (source := imported_from(workspace, "matches")) is not None:
+        wanted = imported_matches(workspace)
+        return complete(
+            workspace, "matches", store, wanted, lambda missing: [], source,
+            inputs=inputs, overwrite=False, unit="pair",
+        )  # fmt: skip
+    kind = traits_of(workspace).features
     device = find_device(run.device)
     # On a CPU each thread takes its own pair: threads that share one wait for each other at every step.
     on_cpu = device == "cpu"
     use_threads(1 if on_cpu else count_threads(run.threads))
-    with store.reader() as read:
-        matcher = Matcher(lambda name: read(name).descriptors, device=device, block_size=config.block_size)
+    with ItemStore(workspace.features, FEATURES).reader() as read:
+        match: Callable[[str, str], Matches]
+        if config.matcher == cfg.Matcher.LIGHTGLUE:
+            match = LightGlueMatcher(read, kind, device=device).match
+        else:
+            nearest = Matcher(
+                lambda name: read(name).descriptors, device=device, block_size=config.block_size
+            )
+            match = nearest.match
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, Matches]]:
-            return threaded(
-                lambda pair: matcher.match(*pair), missing, count_threads(run.threads) if on_cpu else 1
-            )
+            return threaded(lambda pair: match(*pair), missing, count_threads(run.threads) if on_cpu else 1)
 
         return complete(
             workspace,
             "matches",
-            ItemStore(workspace.matches, MATCHES),
-            wanted,
+            store,
+            wanted_matches(workspace, config.matcher),
             produce,
             config,
-            inputs={"features": features.fingerprint, "pairs": pairs.fingerprint},
+            inputs=inputs,
             overwrite=overwrite,
             unit="pair",
         )

@@ -12,6 +12,18 @@
 """
 
 from corrsfm.model.network import CorrAdaptor, NetworkConfig, PruningOutput
-from corrsfm.model.weights import load_network, read_provenance, save_network
+from corrsfm.model.rivals import Rival, RivalConfig, RivalOutput
+from corrsfm.model.weights import build_network, load_network, read_provenance, save_network
 
-__all__ = ["CorrAdaptor", "NetworkConfig", "PruningOutput", "load_network", "read_provenance", "save_network"]
+__all__ = [
+    "CorrAdaptor",
+    "NetworkConfig",
+    "PruningOutput",
+    "Rival",
+    "RivalConfig",
+    "RivalOutput",
+    "build_network",
+    "load_network",
+    "read_provenance",
+    "save_network",
+]

@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Self
 
@@ -43,6 +44,7 @@ __all__ = [
     "CorrAdaptor",
     "NetworkConfig",
     "PruningOutput",
+    "last_logits",
     "symmetric_epipolar_squared",
     "weighted_eight_point",
 ]
@@ -721,12 +723,25 @@ class PruningOutput(NamedTuple):
     """(B,N), squared symmetric epipolar distance of every input to `essential`."""
 
     def last_logits(self) -> Tensor:
-        """Last logit of each input, (B,N) float32: later sets judge fewer. Minus infinity on padding."""
-        last = torch.full(self.residuals.shape, -math.inf, device=self.residuals.device)
-        for values, indices in zip(self.logits, self.indices, strict=True):
-            # Padding says minus infinity, and its index may be that of an input: it must not overwrite.
-            last.scatter_(1, indices, torch.where(values.isneginf(), last.gather(1, indices), values.float()))
-        return last
+        """Last logit of each input, (B,N) float32. Minus infinity on padding."""
+        return last_logits(self.logits, self.indices, self.residuals.shape)
+
+
+def last_logits(logits: Sequence[Tensor], indices: Sequence[Tensor], shape: torch.Size) -> Tensor:
+    """Last logit of each of (B,N) inputs, float32: later sets judge fewer. Minus infinity on padding.
+
+    Parameters
+    ----------
+    logits, indices : sequence of Tensor
+        As in `PruningOutput`.
+    shape : (int, int)
+        B and N.
+    """
+    last = torch.full(shape, -math.inf, device=logits[0].device)
+    for values, places in zip(logits, indices, strict=True):
+        # Padding says minus infinity, and its index may be that of an input: it must not overwrite.
+        last.scatter_(1, places, torch.where(values.isneginf(), last.gather(1, places), values.float()))
+    return last
 
 
 @dataclass(frozen=True, kw_only=True)

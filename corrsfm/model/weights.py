@@ -26,7 +26,7 @@ from typing import Any, Literal, overload
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import NetworkUsage, from_dict, to_dict
+from corrsfm.config import FeatureKind, NetworkUsage, from_dict, to_dict
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
@@ -46,7 +46,9 @@ __all__ = [
     "FORMAT",
     "REGISTRY",
     "BundledCheckpoint",
+    "build_network",
     "checkpoint_sha256",
+    "default_checkpoint",
     "load_network",
     "read_provenance",
     "save_network",
@@ -111,6 +113,16 @@ DEFAULT_CHECKPOINT = "small-mutual"
 """Name of the checkpoint that is loaded by default."""
 
 
+def default_checkpoint(features: FeatureKind) -> str:
+    """Name of the bundled checkpoint for matches of features of a kind."""
+    return DEFAULT_CHECKPOINT
+
+
+def build_network(config: NetworkConfig | RivalConfig) -> CorrAdaptor | Rival:
+    """The network that a configuration describes, with fresh weights; it keeps it as ``config``."""
+    return build_rival(config) if isinstance(config, RivalConfig) else CorrAdaptor.from_config(config)
+
+
 @overload
 def load_network(
     path: Path | str | None = None,
@@ -166,7 +178,7 @@ def load_network(
     if content.get("format") == FORMAT:
         config, state = _read_config(content.get("config"), file), content.get("state_dict")
         found = config.architecture if isinstance(config, RivalConfig) else CORRADAPTOR
-        network = build_rival(config) if isinstance(config, RivalConfig) else CorrAdaptor.from_config(config)
+        network = build_network(config)
     elif "format" in content:
         raise CheckpointError(
             f"{file}: format {content['format']!r}, expected {FORMAT!r}; try a newer corrsfm"
@@ -185,8 +197,8 @@ def load_network(
     if architecture not in (None, found):
         raise CheckpointError(f"{file}: holds the network {found}, expected {architecture}")
     _fill(network.to(map_location), state, f"{file}: not a checkpoint of this network ({found})")
-    if isinstance(network, CorrAdaptor):
-        network.usage = _read_usage(content, file)
+    if "usage" in content:
+        network.usage = _read_usage(content["usage"], file)
     return network.eval()
 
 
@@ -202,7 +214,7 @@ def save_network(
     Parameters
     ----------
     network : CorrAdaptor or Rival
-        Built by `CorrAdaptor.from_config` or `build_rival`. The ``usage`` of a `CorrAdaptor` is written, too.
+        Built by `build_network`. Its ``usage`` is written, too.
     path : path or str
         Replaced in one step if it exists.
     provenance : mapping of plain values, optional
@@ -216,9 +228,7 @@ def save_network(
         Hex SHA-256 of the file, for the registry.
     """
     if network.config is None:
-        raise CheckpointError(
-            f"{path}: the network has no configuration; build it with CorrAdaptor.from_config or build_rival"
-        )
+        raise CheckpointError(f"{path}: the network has no configuration; build it with build_network")
     state = {}
     for name, value in network.state_dict().items():
         value = value.detach().cpu()
@@ -229,11 +239,10 @@ def save_network(
         "format": FORMAT,
         "config": dataclasses.asdict(network.config),
         "state_dict": state,
+        # Through JSON, because a checkpoint holds plain values only, no choices of ours.
+        "usage": json.loads(json.dumps(to_dict(network.usage))),
         "provenance": dict(provenance or {}),
     }
-    if isinstance(network, CorrAdaptor):
-        # Through JSON, because a checkpoint holds plain values only, no choices of ours.
-        content["usage"] = json.loads(json.dumps(to_dict(network.usage)))
     with atomic_path(Path(path)) as unfinished:
         torch.save(content, unfinished)
     return sha256_of(Path(path))
@@ -330,8 +339,7 @@ def _read_config(values: Any, file: Path) -> NetworkConfig | RivalConfig:
         raise CheckpointError(f"{file}: {error}") from error
 
 
-def _read_usage(content: Mapping[str, Any], file: Path) -> NetworkUsage:
-    values = content.get("usage", {})
+def _read_usage(values: Any, file: Path) -> NetworkUsage:
     if not isinstance(values, dict):
         raise CheckpointError(f"{file}: its usage is a {type(values).__name__}, expected a dictionary")
     try:

@@ -1,6 +1,6 @@
 """Retrieval of similar photos from the scene's own local descriptors, without a pretrained vocabulary.
 
-Every photo becomes one vector: its RootSIFT descriptors, rotated to the directions in which descriptors of
+Every photo becomes one vector: its descriptors at unit length, rotated to the directions in which those of
 this scene vary most, are assigned to the nearest of a few words learned from a sample of the scene, and the
 differences to the words are added up (VLAD: Jégou et al., "Aggregating local descriptors into a compact image
 representation", CVPR 2010), each word's sum normalised by itself (Arandjelović and Zisserman, "All about
@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from corrsfm.descriptors import unit_rows
 
 __all__ = ["Vocabulary", "aggregate", "global_vectors", "most_similar", "train_vocabulary"]
 
@@ -44,7 +46,7 @@ class Vocabulary:
 
 
 def global_vectors(
-    names: Sequence[str], load_descriptors: Callable[[str], NDArray[np.uint8]], *, seed: int
+    names: Sequence[str], load_descriptors: Callable[[str], NDArray], *, seed: int
 ) -> NDArray[np.float16]:
     """One vector per photo, from a vocabulary learned on a sample of the photos.
 
@@ -52,7 +54,7 @@ def global_vectors(
     ----------
     names : sequence of str
     load_descriptors : callable
-        Name → (N, D) uint8; called at most twice per photo, so that only one photo is in memory at a time.
+        Name → (N, D); called at most twice per photo, so that only one photo is in memory at a time.
     seed : int
 
     Returns
@@ -71,9 +73,7 @@ def global_vectors(
     return vectors
 
 
-def _sample(
-    names: Sequence[str], load_descriptors: Callable[[str], NDArray[np.uint8]], seed: int
-) -> NDArray[np.uint8]:
+def _sample(names: Sequence[str], load_descriptors: Callable[[str], NDArray], seed: int) -> NDArray:
     """(N, D) descriptors of photos drawn at random."""
     generator = np.random.default_rng(seed)
     chosen = np.sort(generator.choice(len(names), size=min(len(names), NUM_SAMPLED_PHOTOS), replace=False))
@@ -85,12 +85,12 @@ def _sample(
     return np.concatenate([sample for sample in samples if len(sample)] or [np.zeros((0, 1), np.uint8)])
 
 
-def train_vocabulary(descriptors: NDArray[np.uint8], *, seed: int) -> Vocabulary:
+def train_vocabulary(descriptors: NDArray, *, seed: int) -> Vocabulary:
     """Learn directions and words by principal components and k-means.
 
     Parameters
     ----------
-    descriptors : (N, D) uint8
+    descriptors : (N, D) uint8 or float32
         At least one.
     seed : int
 
@@ -99,7 +99,7 @@ def train_vocabulary(descriptors: NDArray[np.uint8], *, seed: int) -> Vocabulary
     Vocabulary
         With fewer words than usual if there are fewer distinct descriptors.
     """
-    values = _unit(descriptors)
+    values = unit_rows(descriptors)
     mean = values.mean(axis=0, dtype=np.float32)
     covariance = np.cov(values - mean, rowvar=False, bias=True).astype(np.float64)
     _, vectors = np.linalg.eigh(np.atleast_2d(covariance))
@@ -118,12 +118,12 @@ def train_vocabulary(descriptors: NDArray[np.uint8], *, seed: int) -> Vocabulary
     return Vocabulary(mean=mean, directions=directions, words=words)
 
 
-def aggregate(descriptors: NDArray[np.uint8], vocabulary: Vocabulary) -> NDArray[np.float32]:
+def aggregate(descriptors: NDArray, vocabulary: Vocabulary) -> NDArray[np.float32]:
     """Vector of one photo.
 
     Parameters
     ----------
-    descriptors : (N, D) uint8
+    descriptors : (N, D) uint8 or float32
     vocabulary : Vocabulary
 
     Returns
@@ -132,7 +132,9 @@ def aggregate(descriptors: NDArray[np.uint8], vocabulary: Vocabulary) -> NDArray
         Of unit length, or zero for N = 0.
     """
     words = vocabulary.words
-    centred = _unit(descriptors) - vocabulary.mean
+    if len(descriptors) == 0:
+        return np.zeros(words.size, np.float32)
+    centred = unit_rows(descriptors) - vocabulary.mean
     points = (centred @ vocabulary.directions).astype(np.float32, copy=False)
     nearest = _nearest(points, words)
     counts = np.bincount(nearest, minlength=len(words))
@@ -193,12 +195,6 @@ def _largest(values: NDArray[np.float32], num: int) -> NDArray[np.bool_]:
     above, level = values > last, values == last
     room = num - np.count_nonzero(above, axis=1, keepdims=True)
     return above | (level & (np.cumsum(level, axis=1, dtype=np.int32) <= room))
-
-
-def _unit(descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Rows scaled to unit length; zero rows stay zero."""
-    values = descriptors.astype(np.float32)
-    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-12)
 
 
 def _nearest(points: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from corrsfm.pairs import strategies
 from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.imported import imported_from, record_imported_pairs
 from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.store import ItemStore
@@ -36,6 +37,8 @@ def make_pairs(
     started = time.monotonic()
     index = read_index(workspace)
     features = workspace.require("features")
+    if (source := imported_from(workspace, "pairs")) is not None:
+        return _keep_imported(workspace, source, index.names)
     files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
     order = ["in the order of time"] if workspace.is_sequence else []
     photos = [[r.name, r.gps] for r in index.records]
@@ -72,6 +75,15 @@ def make_pairs(
     outcome = StageOutcome(stage="pairs", num_items=len(pair_list), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"features": features.fingerprint})
     return outcome
+
+
+def _keep_imported(workspace: Workspace, source: cfg.ImportedConfig, names: list[str]) -> StageOutcome:
+    """Keep the pairs of imported matches, there are no others; photos that are gone take theirs along."""
+    known = read_pairs(workspace)
+    pair_list = _without({name for pair in known.pairs for name in pair} - set(names), known)
+    _warn_if_disconnected(names, pair_list)
+    record_imported_pairs(workspace, pair_list, source)
+    return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
 
 
 def _without(names: set[str], pair_list: PairList) -> PairList:

@@ -9,7 +9,7 @@
     ├── robust.py            LO-RANSAC, MAGSAC++ and the errors to a model
     ├── classical.py         none, ratio, loransac, magsac
     ├── selection.py         what the network sees, and what is kept of it
-    ├── learned.py           corradaptor: owns device, batches and memory
+    ├── learned.py           networks: owns device, batches and memory
     └── cascade.py           the ratio test where it is enough, the network elsewhere
 
 Modules of this folder import each other downwards in the order robust < classical < selection <
@@ -18,11 +18,14 @@ learned < cascade.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from corrsfm.config import PruneConfig, PruneMethod
-from corrsfm.prune.correspondences import make_correspondences, side_information
+from corrsfm.config import FeatureKind, MatchTraits, PruneConfig, PruneMethod
+from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.prune.correspondences import make_correspondences, missing_channels, side_information
 from corrsfm.types import Correspondences, PruneResult
 
 if TYPE_CHECKING:
@@ -37,6 +40,13 @@ __all__ = [
     "make_correspondences",
     "side_information",
 ]
+
+
+logger = logging.getLogger("corrsfm")
+
+SIFT_MAX_RATIO = 0.8
+NO_MAX_RATIO = 1.0
+_WITHOUT_RATIOS = "use --method none, which keeps them for verification, or --method loransac"
 
 
 class PrunerProtocol(Protocol):
@@ -75,13 +85,20 @@ class PrunerProtocol(Protocol):
 
 
 def build_pruner(
-    config: PruneConfig, *, device: str = "auto", seed: int = 0, threads: int = 0
+    config: PruneConfig,
+    *,
+    traits: MatchTraits | None = None,
+    device: str = "auto",
+    seed: int = 0,
+    threads: int = 0,
 ) -> PrunerProtocol:
     """The prune method that a config asks for.
 
     Parameters
     ----------
     config : PruneConfig
+    traits : MatchTraits
+        What the matches to prune carry; taken for SIFT's, and not compared with the network, if not given.
     device : str
         Device of the network: auto, cpu, cuda or cuda:N.
     seed : int
@@ -96,24 +113,37 @@ def build_pruner(
     Raises
     ------
     CheckpointError
-        If a network is needed and its checkpoint cannot be used.
+        If a network is needed and its checkpoint cannot be used, or reads what the matches lack.
+    ConfigError
+        If the method needs the ratios of descriptor distances and the matches have none; if it needs weights
+        that do not come with the package.
     """
     from corrsfm.prune.classical import EstimatorPruner, KeepAll, RatioPruner
 
+    if config.method in (PruneMethod.RATIO, PruneMethod.CASCADE) and traits and not traits.has_ratios:
+        raise ConfigError(
+            f"--method {config.method}: these matches have no ratio of descriptor distances; "
+            f"{_WITHOUT_RATIOS}"
+        )
+
+    max_ratio = config.max_ratio
+    if max_ratio is None:
+        is_sift = traits is None or traits.features == FeatureKind.SIFT
+        max_ratio = SIFT_MAX_RATIO if is_sift else NO_MAX_RATIO
     if config.method is PruneMethod.NONE:
         return KeepAll()
     if config.method is PruneMethod.RATIO:
-        return RatioPruner(config.max_ratio)
-    if config.method is PruneMethod.CORRADAPTOR:
-        return _load_network_pruner(config, device, threads)
-    if config.method is PruneMethod.CASCADE:
+        return RatioPruner(max_ratio)
+    if config.method.architecture is not None:
+        network = _load_network_pruner(config, traits, device, threads)
+        if config.method is not PruneMethod.CASCADE:
+            return network
         from corrsfm.prune.cascade import CascadePruner
 
-        network = _load_network_pruner(config, device, threads)
-        return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=config.max_ratio)
+        return CascadePruner(network, network_fingerprint=network.fingerprint, max_ratio=max_ratio)
     return EstimatorPruner(
         str(config.method),
-        max_ratio=config.max_ratio,
+        max_ratio=max_ratio,
         max_error_px=config.max_error_px,
         seed=seed,
         threads=threads,
@@ -125,27 +155,50 @@ def depends_on_seed(config: PruneConfig) -> bool:
     return config.method in (PruneMethod.LORANSAC, PruneMethod.MAGSAC)
 
 
-def checkpoint_sha256(config: PruneConfig) -> str | None:
-    """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
+def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.SIFT) -> str | None:
+    """SHA-256 of the checkpoint that a config's method uses for features of a kind; None if it uses none.
 
     Raises
     ------
     CheckpointError
         If there is no such checkpoint.
+    ConfigError
+        If no weights of its network come with the package, and the config names none.
     """
-    if config.method not in (PruneMethod.CORRADAPTOR, PruneMethod.CASCADE):
+    if config.method.architecture is None:
         return None
     from corrsfm.model import weights
 
-    return weights.checkpoint_sha256(config.model)
+    return weights.checkpoint_sha256(_checkpoint(config, features))
 
 
-def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Pruner:
+def _checkpoint(config: PruneConfig, features: FeatureKind) -> Path | str:
+    """The checkpoint that a config's method uses: its own, or the bundled one for features of a kind."""
+    from corrsfm.model import weights
+
+    if config.model is not None:
+        return config.model
+    if config.method.architecture != PruneMethod.CORRADAPTOR:
+        raise ConfigError(
+            f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint with "
+            "--model FILE, published or trained with `corrsfm train`"
+        )
+    return weights.default_checkpoint(features)
+
+
+def _load_network_pruner(
+    config: PruneConfig, traits: MatchTraits | None, device: str, threads: int
+) -> Pruner:
     # Imported late because it loads torch.
+    from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    return Pruner.load(
-        config.model,
+    features = FeatureKind.SIFT if traits is None else traits.features
+    name = _checkpoint(config, features)
+    assert config.method.architecture is not None
+    pruner = Pruner.load(
+        name,
+        config.method.architecture,
         device=device,
         operating_point=config.operating_point,
         max_candidates=config.max_candidates,
@@ -153,6 +206,29 @@ def _load_network_pruner(config: PruneConfig, device: str, threads: int) -> Prun
         precision=config.precision,
         threads=threads,
     )
+    if traits is None:
+        return pruner
+    missing = missing_channels(
+        pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
+    )
+    if missing:
+        advice = _WITHOUT_RATIOS
+        if traits.has_ratios:
+            fits = weights.default_checkpoint(features)
+            has_other = config.method.architecture == PruneMethod.CORRADAPTOR and fits != name
+            advice = (f"try --model {fits}, or " if has_other else "try ") + "--method loransac"
+        raise CheckpointError(
+            f"{name}: this network reads {missing}, which {traits.features} features and their matches here "
+            f"lack; {advice}"
+        )
+    if pruner.trained_on != traits.features:
+        logger.warning(
+            "%s: this network was trained on matches of %s, these are of %s; compare with --method loransac",
+            name,
+            pruner.trained_on,
+            traits.features,
+        )
+    return pruner
 
 
 def __getattr__(name: str) -> Any:

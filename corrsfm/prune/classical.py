@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.prune import robust
-from corrsfm.prune.correspondences import distinctiveness
+from corrsfm.prune.correspondences import confidence
 from corrsfm.types import Correspondences, PruneResult
 
 __all__ = ["EstimatorPruner", "KeepAll", "RatioPruner", "select_ratio"]
 
 
 def select_ratio(pair: Correspondences, max_ratio: float) -> NDArray[np.bool_]:
-    """Matches that pass the ratio test and are mutual.
+    """Matches that pass the ratio test and are mutual; without ratios those that are mutual.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ def select_ratio(pair: Correspondences, max_ratio: float) -> NDArray[np.bool_]:
     -------
     (M,) bool
     """
-    return pair.mutual & (pair.ratios <= max_ratio)
+    return pair.mutual & (np.isnan(pair.ratios) | (pair.ratios <= max_ratio))
 
 
 def _result_from_estimate(
@@ -71,7 +71,7 @@ def _result_from_estimate(
 
 
 class KeepAll:
-    """Method ``none``: every match is kept; its score is one minus its ratio."""
+    """Method ``none``: every match is kept; its score is the one it brought, or one minus its ratio."""
 
     name = "none"
     fingerprint = "none"
@@ -80,7 +80,7 @@ class KeepAll:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`."""
         return [
             PruneResult(
-                scores=distinctiveness(pair.ratios),
+                scores=confidence(pair),
                 inlier_mask=np.ones(len(pair), bool),
                 decided_by=self.name,
             )
@@ -108,7 +108,7 @@ class RatioPruner:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`."""
         return [
             PruneResult(
-                scores=distinctiveness(pair.ratios) * pair.mutual,
+                scores=confidence(pair) * pair.mutual,
                 inlier_mask=select_ratio(pair, self._max_ratio),
                 decided_by=self.name,
             )

@@ -18,11 +18,14 @@ from corrsfm.geometry import wrap_angles
 from corrsfm.types import Camera, Correspondences, Features, Matches
 
 __all__ = [
+    "NEUTRAL_CHANNELS",
     "SIDE_CHANNELS",
     "SIDE_LAYOUTS",
+    "confidence",
     "correspondences_from_points",
     "distinctiveness",
     "make_correspondences",
+    "missing_channels",
     "side_channels",
     "side_information",
 ]
@@ -54,9 +57,13 @@ def make_correspondences(
     """
     index0, index1 = matches.indices[:, 0], matches.indices[:, 1]
     points0, points1 = features0.keypoints[index0], features1.keypoints[index1]
-    rotations = features1.orientations[index1] - features0.orientations[index0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        log_scale_ratios = np.log(features1.scales[index1] / features0.scales[index0])
+    log_scale_ratios = rotations = np.full(len(matches), np.nan, np.float32)
+    shapes = (features0.scales, features0.orientations, features1.scales, features1.orientations)
+    if shapes_known := all(values is not None for values in shapes):
+        scales0, turns0, scales1, turns1 = (np.asarray(values) for values in shapes)
+        rotations = turns1[index1] - turns0[index0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_scale_ratios = np.log(scales1[index1] / scales0[index0])
     return Correspondences(
         points0=points0,
         points1=points1,
@@ -70,6 +77,8 @@ def make_correspondences(
         camera0=camera0,
         camera1=camera1,
         name=name,
+        scores=matches.scores,
+        shapes_known=shapes_known,
     )
 
 
@@ -147,6 +156,13 @@ def _pinhole(matrix: ArrayLike, points: NDArray[np.float32]) -> Camera:
     return Camera.from_matrix(matrix, int(width), int(height))
 
 
+def confidence(pair: Correspondences) -> NDArray[np.float32]:
+    """The score that a match brings along, in [0, 1]: of its matcher, else by its ratio; 0 for NaN."""
+    if pair.scores is None:
+        return distinctiveness(pair.ratios)
+    return np.clip(np.nan_to_num(pair.scores, nan=0.0), 0.0, 1.0).astype(np.float32)
+
+
 def distinctiveness(ratios: NDArray[np.floating]) -> NDArray[np.float32]:
     """One minus the ratio of the two nearest descriptor distances, in [0, 1]; 0 where the ratio is NaN."""
     return np.clip(1.0 - np.nan_to_num(ratios, nan=1.0), 0.0, 1.0).astype(np.float32)
@@ -192,8 +208,18 @@ SIDE_CHANNELS = {
 }
 """The side channels of a network's input by name, in order."""
 
+NEUTRAL_CHANNELS = (0.8, 1.0, 0.0, 1.0, 0.0)
+"""Value of each side channel that says least."""
+
 SIDE_LAYOUTS = (0, 2, 5)
-"""How many of them, counted from the first, a network may be made for."""
+"""How many of them, counted from the first, a network may be made for: all, those of descriptors, none."""
+
+
+def missing_channels(num_channels: int, *, has_shapes: bool, has_ratios: bool) -> str:
+    """What matches lack that a network reads, in words; empty if they have everything."""
+    if num_channels and not has_ratios:
+        return "the ratio of descriptor distances"
+    return "scale and orientation of keypoints" if num_channels > 2 and not has_shapes else ""
 
 
 def side_channels(matches: Any, num_channels: int, library: ModuleType) -> Any:

@@ -1,4 +1,4 @@
-"""Prune method ``corradaptor``: numpy in, numpy out around the network; owns device, batches and memory."""
+"""Prune methods by networks: numpy in, numpy out around one; owns device, batches and memory."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import MatchInput, OperatingPoint, Precision, PruneConfig, to_dict
-from corrsfm.errors import CorrsfmError
+from corrsfm.errors import CheckpointError, CorrsfmError, InputError
 from corrsfm.machine import count_threads, find_device
-from corrsfm.model import CorrAdaptor, load_network, weights
-from corrsfm.prune.correspondences import side_information
+from corrsfm.model import CorrAdaptor, Rival, RivalOutput, load_network, weights
+from corrsfm.prune.correspondences import SIDE_LAYOUTS, missing_channels, side_information
 from corrsfm.prune.robust import normalised_residuals
 from corrsfm.prune.selection import readable_matches, score_matches, select_candidates, select_kept
 from corrsfm.types import Correspondences, PruneResult, TwoViewModel
@@ -98,7 +98,7 @@ class Pruner:
 
     Parameters
     ----------
-    network : CorrAdaptor
+    network : CorrAdaptor or Rival
         Is moved to the device and put into evaluation mode. Its ``usage`` says which matches it reads and
         which scores keep one.
     checkpoint_sha256 : str
@@ -113,6 +113,7 @@ class Pruner:
     max_batch_matches : int
         Bound of the matches in a batch, padding included; bounds memory.
     precision : Precision
+        See `choose_precision`; automatically never bfloat16 for a `Rival`, for which it is not measured.
     threads : int
         Pairs pruned at a time on a CPU; 0 for all cores.
     batched : bool, optional
@@ -133,11 +134,9 @@ class Pruner:
     untrained network is less steady: scores change by up to 0.3, and kept matches in a tenth of the runs.
     """
 
-    name = "corradaptor"
-
     def __init__(
         self,
-        network: CorrAdaptor,
+        network: CorrAdaptor | Rival,
         *,
         checkpoint_sha256: str = "in memory",
         device: str = "auto",
@@ -150,10 +149,16 @@ class Pruner:
         compile: bool = False,
     ) -> None:
         self.device = torch.device(find_device(device))
-        self.dtype = choose_precision(precision, self.device, network.head.linear1.in_features)
+        self.name, channels = "corradaptor", 0
+        if isinstance(network, CorrAdaptor):
+            channels = network.head.linear1.in_features
+        elif network.config is not None:
+            self.name = network.config.architecture
+        self.dtype = choose_precision(precision, self.device, channels)
         self._num_threads = count_threads(threads)
         self._batched = self.device.type != "cpu" if batched is None else batched
-        self._side_channels = network.side_channels
+        self.side_channels = network.side_channels
+        self.trained_on = network.usage.features
         self._usage = network.usage
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
         self._network: Callable = network.to(self.device).eval()
@@ -163,20 +168,30 @@ class Pruner:
         self._max_candidates = max_candidates
         self._max_batch_matches = max_batch_matches
         self._warned = False
-        usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage).items())
+        usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage, only_result=True).items())
         self.fingerprint = (
-            f"corradaptor-3 sha256={checkpoint_sha256} operating_point={operating_point} "
+            f"{self.name}-3 sha256={checkpoint_sha256} operating_point={operating_point} "
             f"max_candidates={max_candidates} dtype={self.dtype} {usage}"
         )
 
     @classmethod
-    def load(cls, path: Path | None = None, device: str = "auto", **options: Any) -> Pruner:
+    def load(
+        cls,
+        path: Path | str | None = None,
+        architecture: str = "corradaptor",
+        *,
+        device: str = "auto",
+        **options: Any,
+    ) -> Pruner:
         """A pruner with the network of a checkpoint.
 
         Parameters
         ----------
-        path : Path, optional
-            Checkpoint in this project's or the published format; the bundled one if not given.
+        path : Path or str, optional
+            Checkpoint in this project's or the published format, or the name of a bundled one; that for SIFT
+            if not given.
+        architecture : str
+            The network that it must hold, as for `corrsfm.model.load_network`.
         device : str
             auto, cpu, cuda or cuda:N.
         **options
@@ -185,9 +200,14 @@ class Pruner:
         Raises
         ------
         CheckpointError
-            If there is no usable checkpoint.
+            If there is no usable checkpoint, or if its network reads side channels that nobody computes.
         """
-        network = load_network(path, architecture="corradaptor")
+        network = load_network(path, architecture)
+        if network.side_channels not in SIDE_LAYOUTS:
+            raise CheckpointError(
+                f"{path}: this network reads {network.side_channels} side channels, and corrsfm computes "
+                f"{' or '.join(map(str, SIDE_LAYOUTS))}; train one that reads as many"
+            )
         return cls(network, checkpoint_sha256=weights.checkpoint_sha256(path), device=device, **options)
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
@@ -201,8 +221,15 @@ class Pruner:
         Raises
         ------
         InputError
-            If the network reads mutual matches and a pair does not say which of its matches are.
+            If the network reads mutual matches and a pair does not say which of its matches are, or reads
+            side channels that a pair does not have.
         """
+        for pair in pairs:
+            missing = missing_channels(
+                self.side_channels, has_shapes=pair.shapes_known, has_ratios=pair.scores is None
+            )
+            if len(pair) and missing:
+                raise InputError(f"{pair.name}: this network reads {missing}, which these matches lack")
         candidates = [select_candidates(pair, self._max_candidates, self._usage.input) for pair in pairs]
         self._guard(pairs)
         estimates = self._estimate(pairs, candidates)
@@ -271,11 +298,11 @@ class Pruner:
     def _forward(self, items: Sequence[tuple[Correspondences, NDArray[np.intp]]]) -> list[NetworkEstimate]:
         longest = max(len(rows) for _, rows in items)
         coordinates = np.zeros((len(items), longest, 4), np.float32)
-        side = np.zeros((len(items), longest, self._side_channels), np.float32)
+        side = np.zeros((len(items), longest, self.side_channels), np.float32)
         mask = np.zeros((len(items), longest), bool)
         for index, (pair, rows) in enumerate(items):
             coordinates[index, : len(rows)] = pair.normalised[rows]
-            side[index, : len(rows)] = side_information(pair, self._side_channels)[rows]
+            side[index, : len(rows)] = side_information(pair, self.side_channels)[rows]
             mask[index, : len(rows)] = True
         with (
             torch.inference_mode(),
@@ -283,7 +310,7 @@ class Pruner:
         ):
             output = self._network(
                 torch.from_numpy(coordinates).to(self.device),
-                torch.from_numpy(side).to(self.device) if self._side_channels else None,
+                torch.from_numpy(side).to(self.device) if self.side_channels else None,
                 None if mask.all() else torch.from_numpy(mask).to(self.device),
             )
             logits = output.last_logits()
@@ -294,6 +321,8 @@ class Pruner:
             full = np.full(len(pair), -np.inf, np.float32)
             full[rows] = all_logits[index, : len(rows)]
             determined = len(rows) >= self._min_matches
+            if not determined and isinstance(output, RivalOutput) and output.residuals_decide:
+                full[rows] = -np.inf  # residuals to an arbitrary matrix say nothing
             estimates.append(
                 NetworkEstimate(logits=full, essential=essentials[index] if determined else None)
             )

@@ -53,8 +53,8 @@ def select_candidates(
     Returns
     -------
     (K,) int
-        Increasing indices of the at most ``max_candidates`` finite matches of that kind of smallest ratio;
-        among equal ratios the first ones.
+        Increasing indices of the at most ``max_candidates`` finite matches of that kind of smallest ratio, or
+        of largest score if they have scores instead; among equals the first ones.
 
     Raises
     ------
@@ -65,7 +65,8 @@ def select_candidates(
     usable = np.flatnonzero(finite & readable_matches(pair, match_input))
     if len(usable) <= max_candidates:
         return usable
-    order = np.argsort(np.nan_to_num(pair.ratios[usable], nan=np.inf), kind="stable")
+    rank = pair.ratios if pair.scores is None else -pair.scores
+    order = np.argsort(np.nan_to_num(rank[usable], nan=np.inf), kind="stable")
     return np.sort(usable[order[:max_candidates]])
 
 

@@ -14,6 +14,7 @@ from corrsfm.prune import build_pruner, make_correspondences
 from corrsfm.types import Correspondences, Matches, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
+from corrsfm.workspace.imported import traits_of
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.store import ItemStore
@@ -41,7 +42,7 @@ def prune_matches(
     putative = ItemStore(workspace.matches, MATCHES)
     match_fingerprints = wanted_matches(workspace)
     device, threads = find_device(run.device), count_threads(run.threads)
-    pruner = build_pruner(config, device=device, seed=run.seed, threads=threads)
+    pruner = build_pruner(config, traits=traits_of(workspace), device=device, seed=run.seed, threads=threads)
     group_size = _num_pruned_together(config.method, device, threads)
     wanted = {
         pair: config_hash("prune", fingerprint, pruner.fingerprint, cameras[pair[0]], cameras[pair[1]])
@@ -82,7 +83,7 @@ def prune_matches(
 
 
 def _num_pruned_together(method: cfg.PruneMethod, device: str, threads: int) -> int:
-    with_network = method in (cfg.PruneMethod.CORRADAPTOR, cfg.PruneMethod.CASCADE)
+    with_network = method.architecture is not None
     on_cpu = device == "cpu"
     return (
         PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD * threads if with_network and on_cpu else PAIRS_PRUNED_TOGETHER

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.descriptors import as_integers
 from corrsfm.reconstruction.epipolar import TwoViews
 from corrsfm.reconstruction.views import Rays, Views, rays_of
 from corrsfm.types import Pair
@@ -28,7 +29,6 @@ MIN_SAMPLE = 300
 PAIRS_PER_PHOTO = 2
 # Rows whose distances are held at a time; the block then stays in the cache.
 _BLOCK_ROWS = 256
-_MAX_EXACT_SIZE = 128
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -52,20 +52,20 @@ class Neighbours:
 
 
 def nearest_descriptors(
-    descriptors0: NDArray[np.uint8], descriptors1: NDArray[np.uint8], num: int = NUM_NEIGHBOURS
+    descriptors0: NDArray, descriptors1: NDArray, num: int = NUM_NEIGHBOURS
 ) -> Neighbours:
     """Nearest descriptors by blocked matrix products.
 
     Keypoints whose nearest descriptor fails the ratio against the last of them are left out: no model can
     make a match of them. In most pairs these are most keypoints.
 
-    All sums are integers below 2²⁴ for up to 128 bytes a descriptor, which float32 holds exactly, so the
-    result does not depend on the machine; longer descriptors are computed in float64.
+    All sums are integers (`corrsfm.descriptors`), so the result does not depend on the machine.
 
     Parameters
     ----------
-    descriptors0 : (N0, D) uint8
-    descriptors1 : (N1, D) uint8
+    descriptors0 : (N0, D) uint8 or float32
+        Bytes, or unit vectors.
+    descriptors1 : (N1, D) uint8 or float32
     num : int
 
     Returns
@@ -73,8 +73,7 @@ def nearest_descriptors(
     Neighbours
         ``min(num, N1)`` for each keypoint that is left.
     """
-    exact: type[np.floating] = np.float32 if descriptors0.shape[1] <= _MAX_EXACT_SIZE else np.float64
-    columns: NDArray[np.floating] = np.ascontiguousarray(descriptors1.T, exact)
+    columns: NDArray[np.floating] = np.ascontiguousarray(as_integers(descriptors1).T)
     squared1 = np.sum(columns**2, axis=0)
     num = min(num, len(descriptors1))
     keypoints = [np.zeros(0, np.int32)]
@@ -83,7 +82,7 @@ def nearest_descriptors(
     if num < 2:
         return Neighbours(keypoints=keypoints[0], indices=indices[0], distances_sq=distances_sq[0])
     for start in range(0, len(descriptors0), _BLOCK_ROWS):
-        rows: NDArray[np.floating] = descriptors0[start : start + _BLOCK_ROWS].astype(exact)
+        rows = as_integers(descriptors0[start : start + _BLOCK_ROWS])
         block: NDArray[np.floating] = (-2 * rows) @ columns
         block += squared1
         block += np.sum(rows**2, axis=1)[:, None]
@@ -125,10 +124,10 @@ class NeighbourTables:
     Parameters
     ----------
     load : callable
-        Photo name → (N, D) uint8 descriptors.
+        Photo name → (N, D) descriptors.
     """
 
-    def __init__(self, load: Callable[[str], NDArray[np.uint8]]) -> None:
+    def __init__(self, load: Callable[[str], NDArray]) -> None:
         self._load = load
         self._tables: dict[Pair, Neighbours] = {}
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import pickle
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,9 @@ from torch import Tensor, nn
 
 from corrsfm.errors import CheckpointError
 from corrsfm.files import atomic_path
+from corrsfm.model import CorrAdaptor
 
-__all__ = ["Average", "load_state", "save_state"]
+__all__ = ["Average", "load_state", "save_state", "without_side_channels"]
 
 _FORMAT = "corrsfm-training-1"
 
@@ -79,3 +82,32 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise CheckpointError(f"{path}: not the state of a training run; start without --resume")
     return state
+
+
+def without_side_channels(network: CorrAdaptor, num_left: int, neutral: Sequence[float]) -> CorrAdaptor:
+    """The network without its last side channels, as if they always held their neutral values.
+
+    Parameters
+    ----------
+    network : CorrAdaptor
+    num_left : int
+        Side channels to keep, counted from the first.
+    neutral : sequence of float
+        Value of each side channel of the network where nothing is known.
+
+    Returns
+    -------
+    CorrAdaptor
+    """
+    assert network.config is not None
+    narrow = CorrAdaptor.from_config(dataclasses.replace(network.config, side_channels=num_left))
+    narrow.usage = network.usage
+    state = network.state_dict()
+    dropped = torch.tensor(neutral[num_left:])
+    for block in range(len(network.blocks)):
+        # Side channels are the last columns of a block's input.
+        weight, bias = f"blocks.{block}.stem.weight", f"blocks.{block}.stem.bias"
+        state[bias] = state[bias] + state[weight][:, -len(dropped) :] @ dropped
+        state[weight] = state[weight][:, : -len(dropped)]
+    narrow.load_state_dict(state)
+    return narrow

@@ -7,7 +7,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from corrsfm.config import MatchInput, from_dict, option
+from corrsfm.config import Extractor, FeatureKind, MatchInput, from_dict, option
 from corrsfm.config.fields import load_toml
 from corrsfm.errors import ConfigError
 from corrsfm.geometry import INLIER_THRESHOLD
@@ -29,10 +29,12 @@ __all__ = [
 class PrepareConfig:
     """Photo scenes to labelled pairs."""
 
+    extractor: Extractor = option(Extractor.OPENCV, "SIFT by OpenCV or pycolmap, or a network")
     max_features: int = option(2000, "Keypoints kept per photo, strongest first", minimum=20)
     max_image_size: int = option(
         1600, "Larger photos are scaled down to this longest side", unit="px", minimum=16
     )
+    max_photos_per_scene: int = option(0, "Photos of a scene, drawn at random; 0 for all", minimum=0)
     min_covisible: int = option(10, "Fewest shared points of a pair", minimum=1)
     max_pairs_per_scene: int = option(
         0, "Most pairs of a scene, spread evenly over its range of shared points; 0 for all", minimum=0
@@ -40,7 +42,7 @@ class PrepareConfig:
     negatives: int = option(
         0, "Most pairs of a scene that share nothing, added to learn from as all wrong", minimum=0
     )
-    seed: int = option(0, "Seed of the choice of pairs", minimum=0)
+    seed: int = option(0, "Seed of the choice of photos and pairs", minimum=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +95,7 @@ class TrainConfig:
     val_file: Path | None = option(None, "Compact file of the validation scenes")
     output: Path = option(Path("training"), "Folder of the run: log, checkpoints")
     initial: str = option("", "Checkpoint, or name of a bundled one, whose weights the run starts from")
+    features: FeatureKind = option(FeatureKind.SIFT, "Features that the pairs are of, noted in the weights")
     input: MatchInput = option(
         MatchInput.ALL, "Matches that the network reads: all nearest neighbours, or only the mutual ones"
     )

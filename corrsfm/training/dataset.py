@@ -118,6 +118,8 @@ class RealPairs:
     ----------
     num_pairs : int
     inlier_ratios : (P,) tensor
+    has_shapes : bool
+        Whether all keypoints have scale and orientation.
     """
 
     def __init__(
@@ -150,6 +152,7 @@ class RealPairs:
             name: torch.from_numpy(np.concatenate(values)).to(device) for name, values in parts.items()
         }
         self.num_pairs = len(self._arrays["scene"])
+        self.has_shapes = not bool(self._arrays["log_scales"].isnan().any())
         self.inlier_ratios, num_inliers = self._count_inliers()
         self._weights = self._pair_weights(num_inliers, scene_power)
         if negative_share > 0:

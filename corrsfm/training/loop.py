@@ -15,27 +15,27 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import MatchInput, from_dict, to_dict
+from corrsfm.config import MatchInput, to_dict
 from corrsfm.errors import ConfigError
-from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, save_network
-from corrsfm.prune.correspondences import SIDE_LAYOUTS
+from corrsfm.model import CorrAdaptor, Rival, RivalConfig, build_network, save_network
+from corrsfm.prune.correspondences import missing_channels
 from corrsfm.training.checkpoint import Average, load_state, save_state
 from corrsfm.training.config import TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
+from corrsfm.training.initial import initial_network
 from corrsfm.training.journal import Journal, described_recipe, hardware
-from corrsfm.training.losses import classification_loss, essential_loss, virtual_points
+from corrsfm.training.objectives import objective
 from corrsfm.training.schedule import learning_rate_factor
 from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
 
-__all__ = ["Trainer", "initial_network", "network_config", "train"]
+__all__ = ["Trainer", "train"]
 
 logger = logging.getLogger(__name__)
 
@@ -67,8 +67,8 @@ def train(
     Raises
     ------
     ConfigError
-        If synthetic pairs are wanted for a network that reads mutual matches only; if the output folder holds
-        a run already and ``resume`` is not set.
+        If synthetic pairs are wanted for a network that reads mutual matches only; if the network reads side
+        channels that the pairs lack; if the output folder holds a run already and ``resume`` is not set.
     """
     if recipe.train.input is MatchInput.MUTUAL and recipe.train.synthetic_share > 0:
         raise ConfigError(
@@ -84,6 +84,12 @@ def train(
             negative_share=options.negative_share,
         )
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
+        channels = trainer.network.side_channels
+        if missing := missing_channels(channels, has_shapes=data.has_shapes, has_ratios=True):
+            raise ConfigError(
+                f"network: its {channels} side channels read {missing}, which these pairs lack; set "
+                "side_channels = 2"
+            )
         if trainer.state_path.exists():
             if not resume:
                 raise ConfigError(
@@ -91,51 +97,6 @@ def train(
                 )
             trainer.load()
         return trainer.run()
-
-
-def network_config(recipe: TrainRecipe) -> NetworkConfig:
-    """Read the architecture that a recipe asks for.
-
-    Raises
-    ------
-    ConfigError
-        If it cannot be built, or has side channels that pruning does not compute.
-    """
-    config = from_dict(NetworkConfig, recipe.network, "network")
-    if config.side_channels not in SIDE_LAYOUTS:
-        raise ConfigError(
-            f"network: side_channels is {config.side_channels}, expected one of {list(SIDE_LAYOUTS)}"
-        )
-    return config
-
-
-def initial_network(recipe: TrainRecipe) -> CorrAdaptor:
-    """Build the network that a run starts from: fresh, or that of the recipe's ``initial`` checkpoint.
-
-    It reads what the recipe says; an initial checkpoint may have read another kind of matches.
-
-    Raises
-    ------
-    CheckpointError
-        If that checkpoint cannot be read.
-    ConfigError
-        If the recipe's ``network`` table describes another network than the checkpoint holds; without a table
-        the checkpoint decides.
-    """
-    config = network_config(recipe)
-    if not recipe.train.initial:
-        network = CorrAdaptor.from_config(config)
-        network.usage = replace(network.usage, input=recipe.train.input)
-        return network
-    network = load_network(recipe.train.initial, architecture="corradaptor")
-    assert network.config is not None
-    if recipe.network and network.config != config:
-        raise ConfigError(
-            f"network: differs from that of the initial checkpoint {recipe.train.initial}, which is "
-            f"{to_dict(network.config)}; leave the table out to continue with that network"
-        )
-    network.usage = replace(network.usage, input=recipe.train.input)
-    return network
 
 
 @contextmanager
@@ -180,6 +141,8 @@ class Trainer:
         self.recipe, self.config, self.data, self.device, self.rank = recipe, recipe.train, data, device, rank
         torch.manual_seed(self.config.seed)
         self.network = initial_network(recipe).to(device)
+        shape = self.network.config
+        self.architecture = shape.architecture if isinstance(shape, RivalConfig) else "corradaptor"
         self._synthetic = SyntheticPairs(recipe.synthetic, device)
         self.average = Average(self.network, self.config.ema_decay)
         self.optimiser = torch.optim.AdamW(
@@ -277,27 +240,25 @@ class Trainer:
         return concatenate(parts)
 
     def loss(self, batch: Batch, *, with_essential: bool) -> tuple[Tensor, dict[str, float]]:
-        """The hybrid loss of a batch and its parts."""
+        """The network's published loss of a batch, and its parts."""
         mask = None if bool(batch.mask.all()) else batch.mask
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.config.bfloat16):
             output = self._model(
                 batch.correspondences, side_information(batch, self.network.side_channels), mask
             )
-        distances = batch.distances()
-        steps = [distances.gather(1, indices) for indices in output.indices]
-        masks = None if mask is None else [logits.isfinite() for logits in output.logits]
-        logits = [logits.float() for logits in output.logits]
-        total = classification_loss(logits, steps, masks, self.config.threshold)
-        parts = {"classification": float(total.detach())}
-        related = batch.related
-        if with_essential and bool(related.any()):
-            # Photos of two places have no matrix to find.
-            essential = essential_loss(
-                output.essential.float()[related], virtual_points(batch.matrix[related])
-            )
-            total = total + self.config.essential_weight * essential
-            parts["essential"] = float(essential.detach())
-        return total, parts
+        terms = objective(
+            self.architecture,
+            output,
+            batch.distances(),
+            mask,
+            threshold=self.config.threshold,
+            related=batch.related,
+            matrix=batch.matrix if with_essential else None,
+        )
+        total = terms["classification"]
+        if "essential" in terms:
+            total = total + self.config.essential_weight * terms["essential"]
+        return total, {name: float(term.detach()) for name, term in terms.items()}
 
     def save(self) -> None:
         """Write the state of the run and the averaged weights."""
@@ -350,9 +311,9 @@ class Trainer:
         self._journal.append("validation", row)
         return result
 
-    def _averaged(self) -> CorrAdaptor:
+    def _averaged(self) -> CorrAdaptor | Rival:
         assert self.network.config is not None
-        network = CorrAdaptor.from_config(self.network.config).to(self.device)
+        network = build_network(self.network.config).to(self.device)
         network.usage = self.network.usage
         if self.config.ema_decay > 0:
             self.average.copy_to(network)

@@ -1,4 +1,4 @@
-"""The paper's hybrid loss: classification at every pruning step, essential matrix on virtual points."""
+"""Terms of losses: classification of matches, and how far an estimated matrix is from the true one."""
 
 from __future__ import annotations
 
@@ -11,7 +11,13 @@ from torch.nn import functional as F
 from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.model.network import symmetric_epipolar_squared
 
-__all__ = ["classification_loss", "essential_loss", "virtual_points"]
+__all__ = [
+    "balanced_classification_loss",
+    "classification_loss",
+    "essential_loss",
+    "matrix_loss",
+    "virtual_points",
+]
 
 MARGIN = 0.1
 """Largest distance at which a virtual point counts."""
@@ -23,7 +29,7 @@ def classification_loss(
     mask: Sequence[Tensor] | None = None,
     threshold: float = INLIER_THRESHOLD,
 ) -> Tensor:
-    """Binary cross entropy with adaptive temperature, summed over the pruning steps.
+    """Binary cross entropy with adaptive temperature, summed over the pruning steps (CLNet, CorrAdaptor).
 
     Parameters
     ----------
@@ -56,6 +62,42 @@ def classification_loss(
         )
         total = total + (losses * valid).sum() / valid.sum().clamp(min=1)
     return total
+
+
+def balanced_classification_loss(
+    logits: Sequence[Tensor],
+    distances: Sequence[Tensor],
+    mask: Sequence[Tensor] | None = None,
+    threshold: float = INLIER_THRESHOLD,
+) -> Tensor:
+    """Binary cross entropy in which inliers and outliers of a pair weigh the same (PointCN, OANet).
+
+    The mean over the pairs of half the mean over inliers and half the mean over outliers, summed over the
+    sets of logits. The parameters are those of `classification_loss`.
+    """
+    total = logits[0].new_zeros(())
+    for step, (logit, distance) in enumerate(zip(logits, distances, strict=True)):
+        positive = (distance < threshold).to(logit.dtype)
+        valid = torch.ones_like(positive) if mask is None else mask[step].to(logit.dtype)
+        losses = F.binary_cross_entropy_with_logits(
+            logit.masked_fill(valid == 0, 0.0), positive, reduction="none"
+        )
+        for chosen in (positive * valid, (1 - positive) * valid):
+            means = (losses * chosen).sum(1) / chosen.sum(1).clamp(min=1)
+            total = total + 0.5 * means.mean()
+    return total
+
+
+def matrix_loss(essential: Tensor, matrix: Tensor) -> Tensor:
+    """Mean squared distance of matrices of unit norm, whichever sign is nearer (PointCN).
+
+    Parameters
+    ----------
+    essential, matrix : (B, 3, 3) tensor
+        Estimated and true, of any scale.
+    """
+    estimated, true = (F.normalize(one.flatten(1), dim=1) for one in (essential, matrix))
+    return torch.minimum((estimated - true).square().sum(1), (estimated + true).square().sum(1)).mean()
 
 
 def essential_loss(essential: Tensor, points: Tensor) -> Tensor:

@@ -21,14 +21,15 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_by_pinhole, normalise_points
 from corrsfm.colmap.models import find_model, poses_of, read_model
+from corrsfm.config import FeaturesConfig
 from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError
-from corrsfm.features.sift import extract_features
-from corrsfm.images.photos import read_image
+from corrsfm.features import create_extractor, reads_colour
+from corrsfm.images.photos import read_colour, read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
 from corrsfm.labelled.oanet import write_pairs
 from corrsfm.matches.nearest import match_features
 from corrsfm.training.config import PrepareConfig
-from corrsfm.types import Camera, Features
+from corrsfm.types import Camera
 from corrsfm.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -165,10 +166,18 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         If the folder holds no model, or no photos overlap.
     """
     folder = Path(folder)
-    model = _read_model(folder)
+    model = _thinned(_read_model(folder), config.max_photos_per_scene, config.seed)
     images = _images_folder(folder)
+    extract = create_extractor(
+        FeaturesConfig(
+            extractor=config.extractor,
+            max_features=config.max_features,
+            max_image_size=config.max_image_size,
+        )
+    )
+    read = read_colour if reads_colour(config.extractor) else read_image
     features = [
-        _features(images / name, camera, config)
+        extract(_check_size(images / name, read(images / name), camera), None)
         for name, camera in zip(model.names, model.cameras, strict=True)
     ]
     matchable = [index for index, each in enumerate(features) if len(each) >= _MIN_KEYPOINTS]
@@ -204,14 +213,37 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         keypoint_offsets=_offsets(features),
         keypoints=np.concatenate([each.keypoints for each in features]),
         corrections=np.concatenate(corrections),
-        log_scales=np.log(np.concatenate([each.scales for each in features])),
-        orientations=np.concatenate([each.orientations for each in features]),
+        log_scales=np.log(np.concatenate([_or_nan(each.scales, len(each)) for each in features])),
+        orientations=np.concatenate([_or_nan(each.orientations, len(each)) for each in features]),
         pairs=np.array(pairs, np.int64),
         covisible=np.array([counts[pair] for pair in pairs], np.int64),
         match_offsets=_offsets(neighbours),
         neighbours=np.concatenate(neighbours),
         ratios=np.concatenate(ratios),
         mutual=np.concatenate(mutual),
+    )
+
+
+def _or_nan(values: NDArray[np.float32] | None, num: int) -> NDArray[np.float32]:
+    return np.full(num, np.nan, np.float32) if values is None else values
+
+
+def _thinned(model: _SceneModel, max_photos: int, seed: int) -> _SceneModel:
+    """The model with photos drawn at random."""
+    if max_photos == 0 or len(model.names) <= max_photos:
+        return model
+    chosen = np.sort(np.random.default_rng(seed).choice(len(model.names), max_photos, replace=False))
+    number = {int(old): new for new, old in enumerate(chosen)}
+    return _SceneModel(
+        names=tuple(model.names[index] for index in chosen),
+        cameras=tuple(model.cameras[index] for index in chosen),
+        rotations=model.rotations[chosen],
+        translations=model.translations[chosen],
+        covisible={
+            (number[index0], number[index1]): count
+            for (index0, index1), count in model.covisible.items()
+            if index0 in number and index1 in number
+        },
     )
 
 
@@ -229,14 +261,14 @@ def _images_folder(folder: Path) -> Path:
         raise InputError(f"{folder}: has no images/ and is not the workspace of a reconstruction") from error
 
 
-def _features(path: Path, camera: Camera, config: PrepareConfig) -> Features:
-    image = read_image(path)
-    if image.shape != (camera.height, camera.width):
+def _check_size(path: Path, image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
+    """The photo, if it is as large as its camera says."""
+    if image.shape[:2] != (camera.height, camera.width):
         raise ImageError(
             f"{path}: is {image.shape[1]} × {image.shape[0]} pixels, "
             f"its camera says {camera.width} × {camera.height}"
         )
-    return extract_features(image, max_features=config.max_features, max_image_size=config.max_image_size)
+    return image
 
 
 def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.float32]:

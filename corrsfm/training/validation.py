@@ -15,7 +15,7 @@ from corrsfm.evaluation.two_view.estimators import parse_estimator, pose_errors_
 from corrsfm.evaluation.two_view.filters import parse_filter
 from corrsfm.labelled.compact import read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair
-from corrsfm.model import CorrAdaptor
+from corrsfm.model import CorrAdaptor, Rival
 from corrsfm.prune.correspondences import side_information
 from corrsfm.prune.selection import select_candidates
 from corrsfm.types import PruneResult
@@ -29,7 +29,7 @@ _ESTIMATE = parse_estimator("poselib")
 _SEED = 0
 
 
-def match_scores(network: CorrAdaptor, pair: OANetPair, device: torch.device) -> NDArray[np.float32]:
+def match_scores(network: CorrAdaptor | Rival, pair: OANetPair, device: torch.device) -> NDArray[np.float32]:
     """Probability (M,) that each match is an inlier, by its last logit; 0 for those not read."""
     seen = pair.as_correspondences()
     rows = select_candidates(seen, len(pair), network.usage.input)
@@ -80,7 +80,7 @@ class Validation:
         kept = [result.inlier_mask for result in parse_filter(BASELINE)(self.pairs)]
         self.baseline = self._summary(list(map(pose_error_deg, self.pairs, kept)))
 
-    def run(self, network: CorrAdaptor, device: torch.device) -> dict[str, Any]:
+    def run(self, network: CorrAdaptor | Rival, device: torch.device) -> dict[str, Any]:
         """Score a network at its ``pose_min_score``: pose AUC overall and by scene, precision, recall."""
         network.eval()
         threshold = network.usage.pose_min_score

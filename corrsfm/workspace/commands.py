@@ -62,9 +62,20 @@ def command_for(stage: str, root: Path, photos: Sequence[str], recorded: Mapping
     recorded : mapping
         Stage → the options that it was made with, of the stages that finished.
     """
+    if "has_shapes" in recorded.get(stage, {}):
+        return _import_command(root, photos, recorded)
     command = STAGE_COMMANDS[stage]
     words = ["corrsfm", command, *(photos if command == "extract" else []), str(root)]
     for name, options in _OPTIONS[command].items():
         if name in recorded:
             words += flags_of(options, recorded[name])
     return shlex.join(words)
+
+
+def _import_command(root: Path, photos: Sequence[str], recorded: Mapping[str, dict[str, Any]]) -> str:
+    """The command that imported features, and matches unless they were left."""
+    source = {key: value for key, value in recorded["features"].items() if key != "has_shapes"}
+    words = ["corrsfm", "import", *photos, str(root), *flags_of(cfg.ImportedConfig, source)]
+    if source.get("database") and "has_shapes" not in recorded.get("matches", {}):
+        words.append("--rematch")
+    return shlex.join(words + flags_of(cfg.ImagesConfig, recorded.get("images", {})))

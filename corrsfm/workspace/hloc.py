@@ -2,12 +2,14 @@
 
 ``features.h5``
     Group = photo name; ``keypoints`` (N, 2) float32 with the first pixel's centre at (0, 0), ``scores``
-    (N,) float32, ``descriptors`` (D, N) float16 = uint8 / 512, which is exact, ``image_size`` (2,) int32,
-    and beyond hloc ``scales`` and ``oris`` (N,) float32.
+    (N,) float32, ``descriptors`` (D, N) float16, ``image_size`` (2,) int32, and beyond hloc, where the
+    features have them, ``scales`` and ``oris`` (N,) float32. SIFT's descriptors are uint8 / 512, which is
+    exact; those of networks are unit vectors, and the group says so by ``descriptors`` = "unit".
 ``matches.h5``, ``pruned.h5``
     Group = ``name0/name1`` with slashes inside a name as dashes; ``matches0`` (N0,) int32 with -1 for none
-    and ``matching_scores0`` (N0,) float32. Putative matches score 1 − ratio and carry ``mutual0`` (N0,)
-    bool; kept ones carry the score of the prune method.
+    and ``matching_scores0`` (N0,) float32. Nearest neighbours score 1 − ratio; other matches carry the score
+    of their matcher, and the group says so by ``scored_by`` = "matcher". Both carry ``mutual0`` (N0,) bool.
+    Kept matches carry the score of the prune method.
 
 Every group has the attribute ``fingerprint``; the root has ``format`` and ``version``.
 """
@@ -40,6 +42,8 @@ K = TypeVar("K", bound=Hashable)
 T = TypeVar("T")
 
 HALF_PIXEL = np.float32(0.5)
+UNIT = "unit"
+MATCHER = "matcher"
 
 
 Arrays = dict[str, NDArray[Any]]
@@ -102,31 +106,40 @@ class Kind(Generic[K, T]):
 
 
 def _encode_features(features: Features) -> tuple[Arrays, Attributes]:
-    return {
-        "keypoints": features.keypoints - HALF_PIXEL,
-        "scales": features.scales,
-        "oris": features.orientations,
-        "scores": features.scores,
-        "descriptors": np.ascontiguousarray((features.descriptors.astype(np.float16) / np.float16(512)).T),
-        "image_size": np.asarray(features.image_size, np.int32),
-    }, {}
+    arrays: Arrays = {"keypoints": features.keypoints - HALF_PIXEL, "scores": features.scores}
+    if features.scales is not None:
+        arrays["scales"] = features.scales
+    if features.orientations is not None:
+        arrays["oris"] = features.orientations
+    descriptors = features.descriptors.astype(np.float16)
+    attributes: Attributes = {}
+    if features.descriptors.dtype == np.uint8:
+        descriptors /= np.float16(512)
+    else:
+        attributes["descriptors"] = UNIT
+    arrays["descriptors"] = np.ascontiguousarray(descriptors.T)
+    arrays["image_size"] = np.asarray(features.image_size, np.int32)
+    return arrays, attributes
 
 
 def _decode_features(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Features:
-    """Read our layout or hloc's; arrays that hloc does not write get neutral values."""
+    """Read our layout, or SIFT in hloc's."""
     keypoints = np.asarray(arrays["keypoints"], np.float32) + HALF_PIXEL
     num = len(keypoints)
-    descriptors = _sift_descriptors(np.asarray(arrays["descriptors"], np.float32).T, num)
+    descriptors: NDArray = np.ascontiguousarray(np.asarray(arrays["descriptors"], np.float32).T)
+    if attributes.get("descriptors") != UNIT:
+        descriptors = _sift_descriptors(descriptors, num)
     width, height = (int(value) for value in np.asarray(arrays["image_size"]))
 
-    def vector(name: str, default: float) -> NDArray[np.float32]:
-        return np.asarray(arrays[name], np.float32) if name in arrays else np.full(num, default, np.float32)
+    def vector(name: str) -> NDArray[np.float32] | None:
+        return np.asarray(arrays[name], np.float32) if name in arrays else None
 
+    scores = vector("scores")
     return Features(
         keypoints=keypoints,
-        scales=vector("scales", 1.0),
-        orientations=vector("oris", 0.0),
-        scores=vector("scores", 1.0),
+        scales=vector("scales"),
+        orientations=vector("oris"),
+        scores=np.full(num, np.nan, np.float32) if scores is None else scores,
         descriptors=descriptors,
         image_size=(width, height),
     )
@@ -136,7 +149,8 @@ def _sift_descriptors(descriptors: NDArray[np.float32], num: int) -> NDArray[np.
     """Stored descriptors (N, 128) as bytes; raises `ValueError` if they cannot be SIFT's."""
     if descriptors.shape != (num, 128):
         raise ValueError(
-            f"descriptors of shape {descriptors.shape[::-1]}, expected (128, {num}): only SIFT can be matched"
+            f"descriptors of shape {descriptors.shape[::-1]}, expected SIFT's (128, {num}); those of other "
+            "features come in by corrsfm import"
         )
     # Also false for NaN.
     if not ((descriptors >= 0) & (descriptors <= 1)).all():
@@ -170,10 +184,11 @@ def _num_rows(indices: NDArray[np.int32]) -> int:
 
 def _encode_matches(matches: Matches) -> tuple[Arrays, Attributes]:
     num = _num_rows(matches.indices)
-    arrays = _scatter(num, matches.indices, np.float32(1) - matches.ratios)
+    scores = np.float32(1) - matches.ratios if matches.scores is None else matches.scores
+    arrays = _scatter(num, matches.indices, scores)
     arrays["mutual0"] = np.zeros(num, np.bool_)
     arrays["mutual0"][matches.indices[:, 0]] = matches.mutual
-    return arrays, {}
+    return arrays, {} if matches.scores is None else {"scored_by": MATCHER}
 
 
 def _decode_matches(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) -> Matches:
@@ -184,6 +199,9 @@ def _decode_matches(arrays: Mapping[str, Any], attributes: Mapping[str, Any]) ->
         if "mutual0" in arrays
         else np.ones(len(indices), bool)
     )
+    if attributes.get("scored_by") == MATCHER:
+        unknown = np.full(len(indices), np.nan, np.float32)
+        return Matches(indices=indices, ratios=unknown, mutual=mutual, scores=scores)
     return Matches(indices=indices, ratios=np.clip(np.float32(1) - scores, 0, 1), mutual=mutual)
 
 

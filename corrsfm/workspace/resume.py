@@ -20,6 +20,7 @@ from corrsfm.types import Pair
 from corrsfm.workspace.commands import label_of
 from corrsfm.workspace.folder import StageRecord, Workspace
 from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.imported import imported_from, imported_matches, refuse_foreign
 from corrsfm.workspace.lists import read_index, read_pairs
 from corrsfm.workspace.store import ItemStore
 
@@ -37,6 +38,7 @@ __all__ = [
 logger = logging.getLogger("corrsfm")
 
 _LEFT_OUT = "left out"
+_MATCHER_VERSIONS = {cfg.Matcher.NEAREST: "matches-1", cfg.Matcher.LIGHTGLUE: "lightglue-1"}
 
 K = TypeVar("K")
 T = TypeVar("T")
@@ -101,7 +103,13 @@ def complete(
         Make all items again.
     unit : str
         What an item is, for the progress bar.
+
+    Raises
+    ------
+    WorkspaceError
+        If another tool wrote the file of the store.
     """
+    refuse_foreign(store.path, store.kind)
     started = time.monotonic()
     fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
     finished = set() if overwrite else store.finished(wanted)
@@ -174,11 +182,25 @@ def _shown(value: object) -> str:
     return "+".join(value) if isinstance(value, list) else str(value)
 
 
-def wanted_matches(workspace: Workspace) -> dict[Pair, str]:
-    """Fingerprint that the putative matches of each pair must carry."""
+def wanted_matches(workspace: Workspace, matcher: cfg.Matcher | None = None) -> dict[Pair, str]:
+    """Fingerprint that the putative matches of each pair must carry.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    matcher : Matcher, optional
+        That of the recorded matches if not given.
+    """
+    if imported_from(workspace, "matches") is not None:
+        return imported_matches(workspace)
+    if matcher is None:
+        record = workspace.record_of("matches")
+        # Version 0.1.0 knew one matcher and did not record it.
+        matcher = cfg.Matcher(record.config.get("matcher", "nearest")) if record else cfg.Matcher.NEAREST
+    algorithm = _MATCHER_VERSIONS[matcher]
     fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(read_index(workspace).names)
     return {
-        pair: cfg.config_hash("matches-1", fingerprints[pair[0]], fingerprints[pair[1]])
+        pair: cfg.config_hash(algorithm, fingerprints[pair[0]], fingerprints[pair[1]])
         for pair in read_pairs(workspace).pairs
     }
 

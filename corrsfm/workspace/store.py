@@ -123,6 +123,11 @@ class ItemStore(Generic[K, T]):
         with self._open() as file:
             return {key: self._fingerprint(file, key) for key in keys}
 
+    def held(self, keys: Iterable[K]) -> dict[K, str]:
+        """Fingerprints of those of the items that the file holds; see `fingerprints`."""
+        with self._open() as file:
+            return {key: self._fingerprint(file, key) for key in keys if self.kind.group(key) in file}
+
     def attributes(self, keys: Iterable[K]) -> Iterator[tuple[K, Attributes]]:
         """Attributes of items, read without their datasets.
 

@@ -45,7 +45,8 @@ def commands(group: click.Group = main, prefix: tuple[str, ...] = ()) -> list[tu
 
 
 def test_commands_are_listed_in_the_order_of_a_reconstruction() -> None:
-    assert list(main.commands)[:7] == ["run", "extract", "pairs", "match", "prune", "reconstruct", "report"]
+    order = ["run", "extract", "import", "pairs", "match", "prune", "reconstruct", "report"]
+    assert list(main.commands)[:8] == order
 
 
 @pytest.mark.parametrize("path", commands(), ids=" ".join)

@@ -93,7 +93,7 @@ def test_switches_are_on_or_off_by_default() -> None:
 
 
 def test_a_heading_names_the_table_and_says_what_it_is_about() -> None:
-    assert section_of(cfg.FeaturesConfig) == "features – SIFT extraction"
+    assert section_of(cfg.FeaturesConfig) == "features – keypoints and descriptors"
     assert section_of(cfg.ReconstructionConfig) == "reconstruction – mapping by pycolmap"
 
 

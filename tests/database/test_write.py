@@ -427,3 +427,27 @@ def test_log_settings_of_the_process_come_back(tmp_path: Path) -> None:
         raise ZeroDivisionError
     assert (pycolmap.logging.minloglevel, pycolmap.logging.alsologtostderr) == before
     assert "watch out" in (tmp_path / "log.txt").read_text()
+
+
+def test_features_without_shape_and_with_floats_are_written_as_they_are(tmp_path: Path) -> None:
+    features = {
+        name: dataclasses.replace(
+            one,
+            scales=None,
+            orientations=None,
+            descriptors=np.linspace(-1, 1, NUM_POINTS * 256, dtype=np.float32).reshape(NUM_POINTS, 256),
+        )
+        for name, one in scene_features().items()
+    }
+    path = tmp_path / "database.db"
+    write_database(
+        path, images=images(), cameras=[CAMERA], features=features.__getitem__, kept=[],
+        config=DatabaseConfig(write_descriptors=True),
+    )  # fmt: skip
+    with pycolmap.Database.open(path) as database:
+        (image,) = [one for one in database.read_all_images() if one.name == NAMES[2]]
+        assert database.read_keypoints(image.image_id).shape[1] == 2
+        stored = database.read_descriptors(image.image_id)
+        assert stored.type == pycolmap.FeatureExtractorType.UNDEFINED
+        found = np.ascontiguousarray(stored.data).view(np.float32)
+    np.testing.assert_array_equal(found, features[NAMES[2]].descriptors)

@@ -5,6 +5,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from corrsfm.descriptors import as_integers
 from corrsfm.matches.nearest import Matcher, match_features
 
 
@@ -129,3 +130,35 @@ def test_matches_on_the_gpu_equal_those_on_the_cpu() -> None:
         np.testing.assert_array_equal(on_cpu.indices, on_gpu.indices)
         np.testing.assert_array_equal(on_cpu.mutual, on_gpu.mutual)
         np.testing.assert_allclose(on_cpu.ratios, on_gpu.ratios, rtol=1e-6)
+
+
+def unit_vectors(num: int, seed: int, size: int = 256) -> NDArray[np.float32]:
+    values = np.random.default_rng(seed).normal(size=(num, size)).astype(np.float32)
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("size", [32, 128, 256])
+def test_unit_vectors_have_the_neighbours_of_a_plain_search(size: int) -> None:
+    descriptors0, descriptors1 = unit_vectors(200, 0, size), unit_vectors(170, 1, size)
+    nearest, ratios, _ = plain_matches(descriptors0, descriptors1)
+    matches = match_features(descriptors0, descriptors1)
+    # Steps of 1/2048 may turn round neighbours that almost tie.
+    assert (matches.indices[:, 1] == nearest).mean() > 0.97
+    np.testing.assert_allclose(matches.ratios, ratios, atol=5e-3)
+
+
+def test_matches_of_unit_vectors_do_not_depend_on_the_block_size() -> None:
+    descriptors0, descriptors1 = unit_vectors(300, 0), unit_vectors(500, 1)
+    expected = match_features(descriptors0, descriptors1)
+    for block_size in (7, 64, 333):
+        found = match_features(descriptors0, descriptors1, block_size=block_size)
+        for name in ("indices", "ratios", "mutual"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_sums_of_unit_vectors_are_whole_numbers_in_float32() -> None:
+    integers = as_integers(unit_vectors(50, 2))
+    exact = integers.astype(np.int64)
+    np.testing.assert_array_equal(integers, exact)
+    np.testing.assert_array_equal(integers @ integers.T, exact @ exact.T)
+    assert np.abs(exact @ exact.T).max() * 4 <= 2**24 * 1.01

@@ -155,3 +155,20 @@ def test_retrieval_finds_covisible_photos_of_real_scenes(shared_dir) -> None:  #
     right = [(names[i], names[j]) in covisible for i, found in enumerate(neighbours) for j in found]
     assert len(right) == 4 * 57
     assert np.mean(right) > 0.7
+
+
+def test_unit_vectors_of_any_length_are_compared_and_photos_without_any_left_alone() -> None:
+    rng = np.random.default_rng(0)
+    places = [rng.normal(size=(30, 256)) for _ in range(3)]
+    photos = {
+        f"{place}{view}": (values + 0.1 * rng.normal(size=values.shape)).astype(np.float32)
+        for place, values in enumerate(places)
+        for view in "ab"
+    }
+    photos["none"] = np.zeros((0, 128), np.uint8)
+    names = sorted(photos)
+    nearest = most_similar(global_vectors(names, photos.__getitem__, seed=0), 1)
+    for name, found in zip(names, nearest, strict=True):
+        if name != "none":
+            assert names[found[0]][0] == name[0]
+    assert len(nearest[names.index("none")]) == 0

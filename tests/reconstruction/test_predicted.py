@@ -167,3 +167,16 @@ def test_another_seed_draws_another_sample() -> None:
     chain = list(zip(names, names[1:], strict=False))
     one, other = (sample_pairs(names, chain, max_pairs=40, seed=seed) for seed in (0, 1))
     assert one != other
+
+
+def test_neighbours_of_unit_vectors_are_those_of_their_angles() -> None:
+    rng = np.random.default_rng(0)
+    descriptors1 = rng.normal(size=(60, 256)).astype(np.float32)
+    descriptors1 /= np.linalg.norm(descriptors1, axis=1, keepdims=True)
+    descriptors0 = descriptors1[:40] + 0.02 * rng.normal(size=(40, 256)).astype(np.float32)
+    descriptors0 /= np.linalg.norm(descriptors0, axis=1, keepdims=True)
+    found = nearest_descriptors(descriptors0, descriptors1)
+    np.testing.assert_array_equal(found.keypoints, np.arange(40))
+    np.testing.assert_array_equal(found.indices[:, 0], np.arange(40))
+    distances = ((descriptors0[:, None] - descriptors1[found.indices[:, 0]][:, None]) ** 2).sum(2)[:, 0]
+    np.testing.assert_allclose(found.distances_sq[:, 0] / 2048**2, distances, atol=2e-3)

@@ -17,7 +17,8 @@ from corrsfm.training import loop
 from corrsfm.training.checkpoint import load_state
 from corrsfm.training.config import AugmentConfig, Schedule, TrainConfig, TrainRecipe
 from corrsfm.training.dataset import RealPairs, generator_for
-from corrsfm.training.loop import Trainer, network_config, train
+from corrsfm.training.initial import network_config
+from corrsfm.training.loop import Trainer, train
 from corrsfm.training.schedule import learning_rate_factor
 
 CPU = torch.device("cpu")

@@ -1,5 +1,6 @@
 """Preparing pairs: splits, the choice of pairs, scenes of photos, both layouts; recipes."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -7,14 +8,23 @@ import numpy as np
 import pytest
 import torch
 
-from corrsfm.config import MatchInput
+from corrsfm.config import FeatureKind, MatchInput
 from corrsfm.errors import ConfigError, InputError
+from corrsfm.features import create_extractor
 from corrsfm.labelled.compact import read_labelled_pairs, read_scenes
 from corrsfm.labelled.oanet import read_pairs
-from corrsfm.model import CorrAdaptor, NetworkConfig
-from corrsfm.training.config import NO_AUGMENTATION, PrepareConfig, load_recipe
+from corrsfm.model import CorrAdaptor, NetworkConfig, load_network
+from corrsfm.training import prepare
+from corrsfm.training.config import (
+    NO_AUGMENTATION,
+    PrepareConfig,
+    TrainConfig,
+    TrainRecipe,
+    load_recipe,
+)
 from corrsfm.training.dataset import RealPairs, generator_for
-from corrsfm.training.loop import network_config
+from corrsfm.training.initial import initial_network, network_config
+from corrsfm.training.loop import train
 from corrsfm.training.prepare import (
     choose_pairs,
     prepare_file,
@@ -197,3 +207,36 @@ def test_a_recipe_with_an_unknown_key_is_refused(tmp_path):
     (tmp_path / "b.toml").write_text("[trian]\n")
     with pytest.raises(ConfigError, match="trian"):
         load_recipe(tmp_path / "b.toml")
+
+
+def test_the_network_for_aliked_starts_from_that_for_sift(repository):
+    recipe = load_recipe(repository / "pipelines" / "train_aliked.toml")
+    sift, aliked = load_network(), initial_network(recipe).eval()
+    assert aliked.side_channels == 2 and aliked.usage.features == FeatureKind.ALIKED
+    coordinates = 0.3 * torch.randn(1, 100, 4, generator=torch.Generator().manual_seed(0))
+    ratio = torch.linspace(0, 1, 100).view(1, 100, 1)
+    one, zero = torch.ones_like(ratio), torch.zeros_like(ratio)
+    with torch.no_grad():
+        expected = sift(coordinates, torch.cat([ratio, one, zero, one, zero], -1)).last_logits()
+        found = aliked(coordinates, torch.cat([ratio, one], -1)).last_logits()
+    torch.testing.assert_close(found, expected, atol=1e-3, rtol=1e-3)
+
+
+def test_features_without_scale_are_prepared_as_such(repository, tmp_path, monkeypatch):
+    photo = repository / "sample_scenes" / "courtyard"
+
+    def without_shapes(config):
+        extract = create_extractor(config)
+        return lambda image, mask: dataclasses.replace(extract(image, mask), scales=None, orientations=None)
+
+    monkeypatch.setattr(prepare, "create_extractor", without_shapes)
+    config = PrepareConfig(max_features=300, max_pairs_per_scene=2, max_photos_per_scene=4)
+    prepare_file(tmp_path / "pairs.h5", [photo], config)
+    (scene,) = read_scenes(tmp_path / "pairs.h5")
+    assert len(scene.image_names) == 4
+    assert np.isnan(scene.log_scales).all() and np.isnan(scene.orientations).all()
+    assert not scene.pair(0).as_correspondences().shapes_known
+    options = TrainConfig(train_files=(tmp_path / "pairs.h5",), output=tmp_path / "run", max_steps=1)
+    network = {"channels": 8, "clusters": 4, "neighbors": [6, 3], "heads": 2, "side_channels": 5}
+    with pytest.raises(ConfigError, match="5 side channels read scale and orientation"):
+        train(TrainRecipe(train=options, network=network), device="cpu")

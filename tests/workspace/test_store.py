@@ -257,8 +257,8 @@ def test_a_file_that_cannot_be_opened_now_is_not_to_be_deleted(
 @pytest.mark.parametrize(
     ("descriptors", "text"),
     [
-        (np.full((256, 1), 0.1), r"a\.jpg: descriptors of shape \(256, 1\), expected \(128, 1\)"),
-        (np.full((128, 2), 0.1), r"shape \(128, 2\), expected \(128, 1\)"),
+        (np.full((256, 1), 0.1), r"a\.jpg: descriptors of shape \(256, 1\), expected SIFT's \(128, 1\)"),
+        (np.full((128, 2), 0.1), r"shape \(128, 2\), expected SIFT's \(128, 1\)"),
         (np.full((128, 1), -0.1), "descriptors from -0.1 to -0.1, expected SIFT's"),
         (np.full((128, 1), 12.0), "descriptors from 12 to 12"),
         (np.full((128, 1), np.nan), "descriptors from nan to nan"),

@@ -137,7 +137,7 @@ class PrunerFilter:
 
 
 _SIDE = re.compile(r"(?:nn|mutual|ratio(?P<ratio>0?\.\d+|1(?:\.0)?)(?P<mutual>\+mutual)?)")
-_PRUNER = re.compile(r"(?P<method>[a-z]+)(?:@(?P<point>[a-z]+))?(?::(?P<model>.+))?")
+_PRUNER = re.compile(r"(?P<method>[a-z0-9]+)(?:@(?P<point>[a-z]+))?(?::(?P<model>.+))?")
 
 
 def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> PairFilter:

@@ -15,7 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from corrsfm.model.network import LARGEST_COORDINATE, symmetric_epipolar_squared
+from corrsfm.config import NetworkUsage
+from corrsfm.geometry import INLIER_THRESHOLD
+from corrsfm.model.network import LARGEST_COORDINATE, last_logits, symmetric_epipolar_squared
 
 if TYPE_CHECKING:
     from corrsfm.model.rivals.build import RivalConfig
@@ -40,6 +42,18 @@ class RivalOutput(NamedTuple):
     essentials: list[Tensor]
     """(B,3,3) each: the estimates that the published loss sees, one for each set of logits where a network
     refines its estimate, else the last one only."""
+    residuals_decide: bool = False
+    """Whether the published network judges by `residuals`, as those that prune do, or by the last logits."""
+
+    def last_logits(self) -> Tensor:
+        """The verdict (B,N) on each input, above zero for those that the published network calls right.
+
+        The last logits, or ``log(INLIER_THRESHOLD / residual)`` where residuals decide. Minus infinity on
+        padding.
+        """
+        if self.residuals_decide:
+            return math.log(INLIER_THRESHOLD) - self.residuals.float().log()
+        return last_logits(self.logits, self.indices, self.residuals.shape)
 
 
 class Rival(nn.Module):
@@ -51,6 +65,8 @@ class Rival(nn.Module):
 
     config: RivalConfig | None = None
     """Set by `build_rival`."""
+    usage: NetworkUsage = NetworkUsage()
+    """Goes with the weights into a checkpoint; by default the published operating point."""
     side_channels: int
     """Columns of side information that it expects."""
     pruning_ratio: float = 1.0
@@ -133,12 +149,13 @@ class Inputs:
         *,
         indices: list[Tensor] | None = None,
         masks: list[Tensor | None] | None = None,
+        residuals_decide: bool = False,
     ) -> RivalOutput:
         """Results without the rows that the caller did not hand in, and padding marked.
 
         Parameters
         ----------
-        logits, essentials
+        logits, essentials, residuals_decide
             As in `RivalOutput`, still with all rows.
         indices, masks : list, optional
             Like `logits`, where a set does not hold all rows in their order.
@@ -155,6 +172,7 @@ class Inputs:
             essential=essentials[-1],
             residuals=residuals[:, : self.num_rows],
             essentials=essentials,
+            residuals_decide=residuals_decide,
         )
 
     def _trim(self, logits: Tensor, indices: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from corrsfm.config import NetworkUsage
 from corrsfm.model.network import BatchNorm, full_precision, nearest_neighbors, take_rows
 from corrsfm.model.rivals.inputs import Inputs, Rival, RivalOutput
 from corrsfm.model.rivals.layers import (
@@ -112,6 +113,9 @@ class LMCNet(Rival):
         136 is the network that was published with all features, 134 image features before 2 geometric ones;
         any other number of channels joins the coordinates.
     """
+
+    # The published threshold for YFCC100M; 0.9 for SUN3D.
+    usage = NetworkUsage(pose_min_score=0.95)
 
     def __init__(self, *, channels: int = 128, clusters: int = 128, side_channels: int = 0) -> None:
         super().__init__()

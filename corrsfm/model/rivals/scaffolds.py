@@ -94,4 +94,10 @@ def prune(
         features = torch.cat([kept, take_rows(confidence, order)], dim=-1)
     last, log_weight = head.linear_2(head.embed_2(take_rows(weighted, order), mask)).unbind(-1)
     essential = log_weighted_eight_point(kept[..., :4], last, log_weight, mask)
-    return inputs.output([*logits, last], [essential], indices=[*indices, index], masks=[*masks, mask])
+    return inputs.output(
+        [*logits, last],
+        [essential],
+        indices=[*indices, index],
+        masks=[*masks, mask],
+        residuals_decide=True,
+    )

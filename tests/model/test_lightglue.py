@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tools.aliked_lightglue import deform_conv2d
+from corrsfm.model.lightglue import deform_conv2d
 
 
 def _pixel(image: Tensor, y: float, x: float) -> Tensor:

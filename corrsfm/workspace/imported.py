@@ -1,0 +1,210 @@
+"""What a scene's features and matches are: made here, brought in by `corrsfm import`, or a foreign file.
+
+Imported features carry the fingerprint ``imported PHOTO CONTENT``, two hashes: they hold as long as the photo
+does, and no extractor could make them again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import h5py
+
+from corrsfm import config as cfg
+from corrsfm.errors import ConfigError, WorkspaceError, first_few
+from corrsfm.types import Pair, PairList
+from corrsfm.workspace.folder import StageRecord, Workspace
+from corrsfm.workspace.hloc import FEATURES, MATCHES, Kind
+from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
+from corrsfm.workspace.store import ItemStore
+
+__all__ = [
+    "fingerprint_of_imported",
+    "imported_features",
+    "imported_from",
+    "imported_matches",
+    "record_imported_pairs",
+    "refuse_foreign",
+    "refuse_foreign_files",
+    "traits_of",
+    "traits_to_come",
+]
+
+_IMPORTED = "imported"
+
+
+def imported_from(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
+    """Where what a stage recorded was imported from; None if the stage made it itself."""
+    record = workspace.record_of(stage)
+    if record is None or "has_shapes" not in record.config:
+        return None
+    return cfg.from_dict(cfg.ImportedConfig, record.config, str(workspace.manifest))
+
+
+def fingerprint_of_imported(photo_sha256: str, content: str) -> str:
+    """Fingerprint of imported features of one photo."""
+    return f"{_IMPORTED} {photo_sha256} {content}"
+
+
+def imported_features(workspace: Workspace) -> dict[str, str]:
+    """Fingerprints of the imported features of every photo of the index.
+
+    Raises
+    ------
+    WorkspaceError
+        If a photo is new or has changed since the import.
+    """
+    records = read_index(workspace).records
+    store = ItemStore(workspace.features, FEATURES)
+    held = store.held([record.name for record in records])
+    lacking = [
+        record.name
+        for record in records
+        if not held.get(record.name, "").startswith(f"{_IMPORTED} {record.sha256} ")
+    ]
+    if lacking:
+        raise WorkspaceError(
+            f"{workspace.features}: was imported and holds no features of {first_few(lacking)}, new or "
+            f"changed since; import again ({workspace.command_for('features')} --overwrite), or leave these "
+            "photos out with --image-list"
+        )
+    return {record.name: held[record.name] for record in records}
+
+
+def imported_matches(workspace: Workspace) -> dict[Pair, str]:
+    """Fingerprints of imported matches, which are what they are."""
+    return ItemStore(workspace.matches, MATCHES).fingerprints(read_pairs(workspace).pairs)
+
+
+def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg.ImportedConfig) -> None:
+    """Write the pairs of imported matches and record them as made by the import."""
+    features = workspace.require("features").fingerprint
+    write_pairs(workspace, pair_list)
+    workspace.finish(
+        "pairs",
+        StageRecord(
+            fingerprint=cfg.config_hash("imported pairs", pair_list.pairs, features),
+            config=cfg.to_dict(source),
+            inputs={"features": features},
+            num_items=len(pair_list),
+        ),
+    )
+
+
+def traits_of(workspace: Workspace) -> cfg.MatchTraits:
+    """What the matches of a workspace carry."""
+    records = {stage: workspace.record_of(stage) for stage in ("features", "matches")}
+    recorded = {stage: record.config if record else {} for stage, record in records.items()}
+    features = cfg.FeaturesConfig()
+    if (extractor := recorded["features"].get("extractor")) is not None:
+        features = cfg.FeaturesConfig(extractor=cfg.Extractor(extractor))
+    matcher = cfg.Matcher(recorded["matches"].get("matcher", cfg.Matcher.NEAREST))
+    return traits_to_come(workspace, features, cfg.MatchesConfig(matcher=matcher))
+
+
+def traits_to_come(
+    workspace: Workspace | None, features: cfg.FeaturesConfig, matches: cfg.MatchesConfig
+) -> cfg.MatchTraits:
+    """What the matches of a run with these options will carry.
+
+    Parameters
+    ----------
+    workspace : Workspace or None
+        Imported features and matches in it are kept.
+    features : FeaturesConfig
+    matches : MatchesConfig
+
+    Raises
+    ------
+    ConfigError
+        If the options ask for other features or matches than the imported ones, or the matcher does not know
+        the features.
+    """
+    own_features = imported_from(workspace, "features") if workspace else None
+    own_matches = imported_from(workspace, "matches") if workspace else None
+    if own_features is not None and workspace is not None:
+        _refuse_others(workspace, "features", features.extractor, cfg.FeaturesConfig().extractor)
+        kind, has_shapes = own_features.kind, own_features.has_shapes
+    else:
+        kind, has_shapes = features.extractor.kind, features.extractor.kind == cfg.FeatureKind.SIFT
+    if own_matches is not None and workspace is not None:
+        _refuse_others(workspace, "matches", matches.matcher, cfg.MatchesConfig().matcher)
+    learned = matches.matcher == cfg.Matcher.LIGHTGLUE
+    if learned and kind not in cfg.LIGHTGLUE_KINDS:
+        raise ConfigError(
+            f"--matcher lightglue has weights for {' and '.join(cfg.LIGHTGLUE_KINDS)}, these features are "
+            f"{kind}; use --matcher nearest, or --extractor {cfg.LIGHTGLUE_KINDS[0]} in another workspace"
+        )
+    return cfg.MatchTraits(
+        features=kind, has_shapes=has_shapes, has_ratios=own_matches is None and not learned
+    )
+
+
+def _refuse_others(workspace: Workspace, what: str, wanted: str, default: str) -> None:
+    if wanted != default:
+        raise ConfigError(
+            f"{workspace.root}: its {what} were imported and are kept; for those of {wanted} choose another "
+            "folder"
+        )
+
+
+def refuse_foreign_files(workspace_dir: Path) -> None:
+    """Refuse a folder whose files of features or matches another tool wrote; nothing is touched.
+
+    Raises
+    ------
+    WorkspaceError
+        Naming the file, what it holds and how to import it.
+    """
+    kinds: Mapping[str, Kind] = {"features.h5": FEATURES, "matches.h5": MATCHES}
+    for name, kind in kinds.items():
+        refuse_foreign(workspace_dir / name, kind)
+
+
+def refuse_foreign(path: Path, kind: Kind) -> None:
+    """Refuse to write a file that another tool wrote.
+
+    Raises
+    ------
+    WorkspaceError
+        Naming the file, what it holds and how to import it.
+    """
+    if not path.is_file():
+        return
+    try:
+        with h5py.File(path, "r") as file:
+            if str(file.attrs.get("format", "")).startswith("corrsfm-"):
+                return
+            what = _describe(file)
+    except OSError:
+        # Damaged, or no HDF5 at all: whoever reads it says so.
+        return
+    folder = path.parent
+    flags = f"--features {path}"
+    if kind.label == MATCHES.label:
+        flags = f"--features {folder / 'features.h5'} --matches {path}"
+    raise WorkspaceError(
+        f"{path}: another tool wrote it ({what}); it is not overwritten. Choose another folder, or use what "
+        f"it holds there: corrsfm import PHOTOS ANOTHER_FOLDER {flags}"
+    )
+
+
+def _describe(file: h5py.File) -> str:
+    """What a foreign HDF5 file holds, in a few words."""
+    num_photos = num_pairs = 0
+    size = 0
+
+    def visit(name: str, item: object) -> None:
+        nonlocal num_photos, num_pairs, size
+        if isinstance(item, h5py.Group) and "keypoints" in item:
+            num_photos += 1
+            if not size and "descriptors" in item:
+                size = item["descriptors"].shape[0]
+        if isinstance(item, h5py.Group) and "matches0" in item:
+            num_pairs += 1
+
+    file.visititems(visit)
+    if num_photos:
+        return f"keypoints of {num_photos} photos" + (f", descriptors of {size} numbers" if size else "")
+    return f"matches of {num_pairs} pairs" if num_pairs else "neither keypoints nor matches in hloc's layout"

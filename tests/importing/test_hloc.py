@@ -1,0 +1,283 @@
+"""hloc's files come in as they are, or not at all."""
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from foreign_files import NUM, SIZE, unit_vectors, write_features, write_matches
+from photos import write_photos
+
+import corrsfm
+from corrsfm import config as cfg
+from corrsfm import pipeline
+from corrsfm.errors import ConfigError, CorrsfmError, InputError, WorkspaceError
+from corrsfm.importing.scene import import_features
+from corrsfm.workspace import Workspace
+
+RUN = cfg.RunConfig(threads=1, device="cpu")
+
+
+@pytest.fixture
+def photos(tmp_path: Path) -> Path:
+    write_photos(tmp_path / "photos", 3)
+    return tmp_path / "photos"
+
+
+@pytest.fixture
+def names(photos: Path) -> list[str]:
+    return sorted(path.name for path in photos.iterdir())
+
+
+@pytest.fixture
+def features(tmp_path: Path, names: list[str]) -> Path:
+    write_features(tmp_path / "features.h5", names)
+    return tmp_path / "features.h5"
+
+
+def edit(path: Path, name: str, key: str, value: object) -> None:
+    """Replace a data set, or drop it for None."""
+    with h5py.File(path, "r+") as file:
+        del file[name][key]
+        if value is not None:
+            file[name][key] = value
+
+
+def test_features_come_in_with_half_a_pixel_and_without_what_they_lack(
+    photos: Path, features: Path, tmp_path: Path, names: list[str]
+) -> None:
+    result = import_features(photos, tmp_path / "scene", features=features, kind="superpoint")
+    assert (result.num_photos, result.num_keypoints, result.descriptor_size) == (3, 3 * NUM, SIZE)
+    assert (result.kind, result.has_shapes, result.num_pairs) == (cfg.FeatureKind.SUPERPOINT, False, 0)
+    found = corrsfm.open_workspace(tmp_path / "scene").features(names[0])
+    np.testing.assert_array_equal(found.keypoints[2], [2.5, 1.5])
+    np.testing.assert_allclose(found.descriptors, unit_vectors(NUM, 0), atol=5e-4)
+    np.testing.assert_allclose(found.scores, np.linspace(1, 0.1, NUM), rtol=1e-6)
+    assert found.scales is None and found.orientations is None
+
+
+def test_the_stages_go_on_from_imported_features_and_keep_them(
+    photos: Path, features: Path, tmp_path: Path, names: list[str]
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features)
+    workspace = Workspace(tmp_path / "scene")
+    before = workspace.features.stat().st_mtime_ns
+    for overwrite in (False, True):
+        pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+        outcome = pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN, overwrite=overwrite)
+        assert outcome.skipped and workspace.features.stat().st_mtime_ns == before
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN)
+    matches = corrsfm.open_workspace(tmp_path / "scene").matches((names[0], names[1]))
+    np.testing.assert_array_equal(matches.indices[:, 0], matches.indices[:, 1])
+    assert matches.mutual.all() and (matches.ratios == 0).all()
+
+
+def test_matches_come_in_and_are_not_made_again(
+    photos: Path, features: Path, tmp_path: Path, names: list[str]
+) -> None:
+    write_matches(tmp_path / "matches.h5", [(names[1], names[0]), (names[0], names[2])])
+    result = import_features(photos, tmp_path / "scene", features=features, matches=tmp_path / "matches.h5")
+    assert (result.num_pairs, result.num_matches) == (2, NUM)
+    workspace = Workspace(tmp_path / "scene")
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    for stage in (
+        pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN),
+        pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN),
+        pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN),
+    ):
+        assert stage.skipped, stage
+    scene = corrsfm.open_workspace(tmp_path / "scene")
+    assert scene.pairs == ((names[0], names[1]), (names[0], names[2]))
+    found = scene.matches(scene.pairs[0])
+    np.testing.assert_array_equal(found.indices, np.repeat(np.arange(0, NUM, 2)[:, None], 2, axis=1))
+    assert np.isnan(found.ratios).all() and found.mutual.all()
+    assert found.scores is not None and (found.scores == 0.75).all()
+    kept = pipeline.prune_matches(workspace, cfg.PruneConfig(method=cfg.PruneMethod.NONE), RUN)
+    assert kept.num_items == 2
+    for method in (cfg.PruneMethod.RATIO, cfg.PruneMethod.CORRADAPTOR):
+        with pytest.raises(CorrsfmError, match="ratio of descriptor distances.*--method loransac"):
+            pipeline.prune_matches(workspace, cfg.PruneConfig(method=method), RUN)
+
+
+def test_options_for_other_features_are_refused_before_any_work(
+    photos: Path, features: Path, tmp_path: Path
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features)
+    with pytest.raises(ConfigError, match="features were imported and are kept; for those of disk"):
+        pipeline.check_options(
+            RUN,
+            features=cfg.FeaturesConfig(extractor=cfg.Extractor.DISK),
+            workspace_dir=tmp_path / "scene",
+        )
+    with pytest.raises(
+        ConfigError, match="lightglue has weights for aliked and disk, these features are other"
+    ):
+        pipeline.check_options(
+            RUN,
+            matches=cfg.MatchesConfig(matcher=cfg.Matcher.LIGHTGLUE),
+            workspace_dir=tmp_path / "scene",
+        )
+
+
+def test_a_photo_that_changed_after_the_import_is_named(
+    photos: Path, features: Path, tmp_path: Path, names: list[str]
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features)
+    (photos / names[1]).write_bytes((photos / names[0]).read_bytes())
+    workspace = Workspace(tmp_path / "scene")
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    with pytest.raises(WorkspaceError, match=f"no features of {names[1]}.*corrsfm import .*--features"):
+        pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN)
+
+
+def test_half_precision_keypoints_are_warned_of(
+    photos: Path, names: list[str], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_features(tmp_path / "half.h5", names, half=True)
+    with caplog.at_level(logging.WARNING, "corrsfm"):
+        import_features(photos, tmp_path / "scene", features=tmp_path / "half.h5")
+    assert "keypoints of 3 photos are half-precision numbers" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("break_it", "text"),
+    [
+        (
+            lambda path, name: edit(path, name, "descriptors", None),
+            "has no 'descriptors', only keypoints, scores",
+        ),
+        (
+            lambda path, name: edit(path, name, "descriptors", unit_vectors(NUM, 0)),
+            r"descriptors have shape \(40, 64\), expected \(D, 40\)",
+        ),
+        (
+            lambda path, name: edit(path, name, "descriptors", unit_vectors(NUM, 0, 32).T),
+            "descriptors of .* are 64 × float32, those of .* are 32 × float32",
+        ),
+        (
+            lambda path, name: edit(path, name, "keypoints", np.full((NUM, 2), np.nan, np.float32)),
+            "keypoint 0 is not a finite number",
+        ),
+        (
+            lambda path, name: edit(path, name, "keypoints", np.full((NUM, 2), 5000, np.float32)),
+            r"keypoint 0 at \(5000.5, 5000.5\) lies outside of the photo",
+        ),
+        (
+            lambda path, name: edit(path, name, "keypoints", np.zeros((NUM, 3), np.float32)),
+            r"shape \(40, 3\)",
+        ),
+        (lambda path, name: edit(path, name, "scores", np.zeros(3, np.float32)), r"scores have shape \(3,\)"),
+    ],
+)
+def test_bad_features_are_refused_and_leave_nothing(
+    photos: Path,
+    features: Path,
+    tmp_path: Path,
+    names: list[str],
+    break_it: Callable[[Path, str], None],
+    text: str,
+) -> None:
+    break_it(features, names[1])
+    with pytest.raises(InputError, match=text) as error:
+        import_features(photos, tmp_path / "scene", features=features)
+    assert str(features) in str(error.value) and names[1] in str(error.value)
+    assert not (tmp_path / "scene").exists()
+
+
+def test_names_must_be_those_of_the_photos(photos: Path, names: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "features.h5"
+    write_features(path, [f"db/{name}" for name in names])
+    with pytest.raises(InputError, match=f"its names are like 'db/{names[0]}', these photos are like"):
+        import_features(photos, tmp_path / "scene", features=path)
+    write_features(path, [*names, "query.jpg"])
+    with pytest.raises(InputError, match="features of query.jpg, which .* does not hold"):
+        import_features(photos, tmp_path / "scene", features=path)
+    write_features(path, names[:2])
+    with pytest.raises(InputError, match=f"no features of {names[2]}"):
+        import_features(photos, tmp_path / "scene", features=path)
+
+
+@pytest.mark.parametrize(
+    ("matches", "text"),
+    [
+        (np.full(NUM, NUM, np.int32), "names keypoint 40 of the second photo, which has 40"),
+        (np.full(NUM, -2, np.int32), "names keypoint -2 of the second photo"),
+        (np.zeros(NUM + 1, np.int32), "matches of 41 keypoints, but the first photo has 40"),
+        (np.zeros(NUM, np.float32), "matches0 is float32, expected integers"),
+    ],
+)
+def test_bad_matches_are_refused_and_leave_nothing(
+    photos: Path, features: Path, names: list[str], tmp_path: Path, matches: np.ndarray, text: str
+) -> None:
+    path = tmp_path / "matches.h5"
+    with h5py.File(path, "w") as file:
+        file[f"{names[0]}/{names[1]}/matches0"] = matches
+    with pytest.raises(InputError, match=text) as error:
+        import_features(photos, tmp_path / "scene", features=features, matches=path)
+    assert f"{names[0]} – {names[1]}" in str(error.value)
+    assert not (tmp_path / "scene").exists()
+
+
+def test_pairs_of_other_photos_twice_or_of_one_photo_are_refused(
+    photos: Path, features: Path, names: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "matches.h5"
+    for pairs, text in (
+        ([(names[0], "x.jpg")], "not there: x.jpg"),
+        ([(names[0], names[1]), (names[1], names[0])], "the pair is there twice"),
+        ([(names[0], names[0])], "a photo is matched with itself"),
+    ):
+        write_matches(path, pairs)
+        with pytest.raises(InputError, match=text):
+            import_features(photos, tmp_path / "scene", features=features, matches=path)
+
+
+def test_a_workspace_with_features_keeps_them(photos: Path, features: Path, tmp_path: Path) -> None:
+    import_features(photos, tmp_path / "scene", features=features)
+    before = (tmp_path / "scene" / "features.h5").read_bytes()
+    with pytest.raises(WorkspaceError, match="is there already; choose another folder, or add --overwrite"):
+        import_features(photos, tmp_path / "scene", features=features)
+    assert (tmp_path / "scene" / "features.h5").read_bytes() == before
+    import_features(photos, tmp_path / "scene", features=features, overwrite=True)
+
+
+def test_one_source_must_be_given(photos: Path, features: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="give --features, or --database"):
+        import_features(photos, tmp_path / "scene")
+    with pytest.raises(InputError, match="cannot be read as HDF5"):
+        (tmp_path / "text.h5").write_text("no")
+        import_features(photos, tmp_path / "scene", features=tmp_path / "text.h5")
+
+
+@pytest.mark.parametrize("name", ["features.h5", "matches.h5"])
+def test_a_file_of_another_tool_is_never_overwritten(
+    photos: Path, names: list[str], tmp_path: Path, name: str
+) -> None:
+    folder = tmp_path / "hloc"
+    folder.mkdir()
+    if name == "features.h5":
+        write_features(folder / name, names)
+        holds = "keypoints of 3 photos, descriptors of 64 numbers"
+    else:
+        write_matches(folder / name, [(names[0], names[1])])
+        holds = "matches of 1 pairs"
+    before = (folder / name).read_bytes()
+    with pytest.raises(
+        WorkspaceError, match=f"{name}: another tool wrote it .{holds}.*corrsfm import PHOTOS"
+    ):
+        pipeline.run_scene(photos, folder, cfg.PipelineConfig(run=RUN))
+    assert [path.name for path in folder.iterdir()] == [name]
+    assert (folder / name).read_bytes() == before
+
+
+def test_a_foreign_file_put_into_a_workspace_is_not_overwritten(
+    photos: Path, names: list[str], tmp_path: Path
+) -> None:
+    workspace = Workspace(tmp_path / "scene", create=True)
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
+    write_features(workspace.features, names)
+    with pytest.raises(WorkspaceError, match="another tool wrote it"):
+        pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN, overwrite=True)
