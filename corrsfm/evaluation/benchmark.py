@@ -76,7 +76,7 @@ def run_benchmark(
     Parameters
     ----------
     model : Path, optional
-        Checkpoint of any network. If not given, CorrAdaptor as published with fresh weights, which is as fast.
+        Checkpoint of any network. If not given, CorrAdaptor as published with fresh weights: as fast.
     devices : sequence of str
     sizes : sequence of int
         Matches a pair.
