@@ -23,7 +23,9 @@ _FOREIGN_SUFFIXES = (
 logger = logging.getLogger("corrsfm")
 
 
-def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path | None = None) -> list[str]:
+def list_images(
+    folder: Path, *, image_list: Path | None = None, mask_dir: Path | None = None, at_least: int = 2
+) -> list[str]:
     """Names of the photos in a folder and its sub-folders, sorted.
 
     Parameters
@@ -36,17 +38,19 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
     mask_dir : Path, optional
         Folder of masks. If it lies inside the folder, nothing in it is a photo; if it is the folder itself,
         ``NAME.png`` beside a photo ``NAME`` is not a photo. A list overrules this.
+    at_least : int
+        Photos that there must be: two for a scene of their own.
 
     Returns
     -------
     list of str
-        Posix paths relative to the folder, at least two.
+        Posix paths relative to the folder.
 
     Raises
     ------
     InputError
-        If the folder or the list cannot be read, the list names photos that do not exist, or fewer than two
-        photos remain.
+        If the folder or the list cannot be read, the list names photos that do not exist, or too few photos
+        remain.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected the folder with the photos")
@@ -71,11 +75,10 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
             f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot:"
             f" {first_few(map(ascii, separating))}; rename them"
         )
-    if len(names) < 2:
+    if len(names) < at_least:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
-        raise InputError(
-            f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
-        )
+        needed = "at least two overlapping photos are needed" if at_least > 1 else "expected photos"
+        raise InputError(f"{where}: {found}; {needed} ({', '.join(IMAGE_SUFFIXES)})")
     return sorted(names)
 
 

@@ -15,12 +15,12 @@ from corrsfm.pairs import strategies
 from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
-from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
+from corrsfm.workspace.lists import Index, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
 
-__all__ = ["make_pairs"]
+__all__ = ["fingerprint_of", "make_pairs"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -36,10 +36,7 @@ def make_pairs(
     started = time.monotonic()
     index = read_index(workspace)
     features = workspace.require("features")
-    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
-    fingerprint = config_hash(
-        "pairs", config, run.seed, [[r.name, r.gps] for r in index.records], features.fingerprint, *files
-    )
+    fingerprint = fingerprint_of(index, features.fingerprint, config, run.seed)
     left_out = photos_left_out(workspace, index.names)
     records = [record for record in index.records if record.name not in left_out]
     if len(records) < 2:
@@ -55,7 +52,7 @@ def make_pairs(
     explain(workspace, "pairs", config)
     with ItemStore(workspace.features, FEATURES).reader() as read:
         # A list or a model may name photos that were left out.
-        candidates = index.records if files else records
+        candidates = index.records if config.pairs_file or config.covisible_model else records
         pair_list = _without(
             left_out, strategies.make_pairs(candidates, config, load_features=read, seed=run.seed)
         )
@@ -69,6 +66,12 @@ def make_pairs(
     outcome = StageOutcome(stage="pairs", num_items=len(pair_list), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"features": features.fingerprint})
     return outcome
+
+
+def fingerprint_of(index: Index, features: str, config: cfg.PairsConfig, seed: int) -> str:
+    """What the record of the stage must carry to be current; ``features`` is the fingerprint of theirs."""
+    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
+    return config_hash("pairs", config, seed, [[r.name, r.gps] for r in index.records], features, *files)
 
 
 def _without(names: set[str], pair_list: PairList) -> PairList:

@@ -42,7 +42,7 @@ from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
 from corrsfm.reconstruction.views import Views, rays_of, views_of
 from corrsfm.types import Features, Pair
 
-__all__ = ["SceneEvidence", "Selection", "policy_for", "select_model"]
+__all__ = ["SceneEvidence", "Selection", "judge_as_it_is", "policy_for", "select_model"]
 
 FIRST = "first"
 _MENDED = "+mended"
@@ -324,6 +324,30 @@ def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first
         verdict=_verdict(attempt.model, choice, len(evidence.names), attempt.evidence),
         folds=attempt.evidence,
         left_out=attempt.removed,
+    )
+
+
+def judge_as_it_is(
+    model: pycolmap.Reconstruction, evidence: SceneEvidence, *, name: str, reason: str
+) -> Selection:
+    """The verdict on a model without looking for a better one.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    evidence : SceneEvidence
+    name, reason : str
+        What to call it in the record, and why nothing else was tried.
+    """
+    views = views_of(model)
+    chosen = Tried(name=name, views=views, explained=evidence.explain(views), seconds=0.0)
+    choice = Choice(chosen=chosen, tried=(chosen,), reason=reason)
+    folds = judge_model(model, evidence.verified).evidence
+    return Selection(
+        model=model,
+        choice=choice,
+        verdict=_verdict(model, choice, len(evidence.names), folds),
+        folds=folds,
     )
 
 

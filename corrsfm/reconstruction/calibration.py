@@ -117,15 +117,18 @@ def refine_intrinsics(
 
 
 def adjust(
-    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    problem: pycolmap.BundleAdjustmentConfig | None = None,
 ) -> pycolmap.BundleAdjustmentSummary:
-    """Adjust a whole model in place, without the summary in the terminal.
+    """Adjust a whole model in place, or what a problem says, without the summary in the terminal.
 
     `pycolmap.bundle_adjustment` does the same but logs to the terminal.
     """
     options.print_summary = False
-    problem = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        problem.add_image(image_id)
-    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if problem is None:
+        problem = pycolmap.BundleAdjustmentConfig()
+        for image_id in model.reg_image_ids():
+            problem.add_image(image_id)
+        problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     return pycolmap.create_default_bundle_adjuster(options, problem, model).solve()

@@ -16,7 +16,7 @@ from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
 from corrsfm.errors import ReconstructionError, first_few
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, policy_for, select_model
@@ -25,7 +25,7 @@ from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.record import record_of
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
-from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.lists import read_added, read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
@@ -33,7 +33,7 @@ from corrsfm.workspace.warned import keeps_warnings
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["reconstruct"]
+__all__ = ["fingerprint_of", "reconstruct"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -51,15 +51,18 @@ def reconstruct(
     """
     started = time.monotonic()
     verified = require_database(workspace)
-    fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
+    fingerprint = fingerprint_of(verified.fingerprint, config, run.seed)
     # Models without colours are remade once the photos are back.
     black = config_hash("black", fingerprint)
     images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
     current = [fingerprint] if images_dir else [fingerprint, black]
     if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
+        if added := read_added(workspace):
+            logger.info("models: %d photos were added to them without mapping again; kept", len(added))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
+    _keep_grown_models(workspace)
     workspace.forget("models")
     names = read_index(workspace).names
     if images_dir is None:
@@ -91,9 +94,38 @@ def reconstruct(
             raise
     if choice.record is not None:
         atomic_write_json(workspace.evidence, choice.record)
+    for path in (workspace.added, workspace.adding):
+        path.unlink(missing_ok=True)
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
+
+
+def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -> str:
+    """What the record of the stage must carry to be current; ``verified`` is that of the verified matches."""
+    return config_hash("models", pycolmap_version(), verified, config, seed)
+
+
+def _keep_grown_models(workspace: Workspace) -> None:
+    """Before all is mapped again: say what that means for photos that were added, and keep a copy."""
+    if workspace.adding.exists():
+        logger.warning(
+            "an addition of photos was not finished; all photos are mapped again instead, and every pose "
+            "moves; to finish it instead, stop and run: corrsfm add %s",
+            workspace.root,
+        )
+    added = read_added(workspace)
+    if not added or not workspace.sparse.is_dir():
+        return
+    with atomic_path(workspace.root / "sparse.old") as copy:
+        shutil.copytree(workspace.sparse, copy)
+    logger.warning(
+        "%d photos had been added to the models without moving the others (%s); all photos are mapped again "
+        "now and every pose moves; the models so far are kept in %s",
+        len(added),
+        first_few(added),
+        workspace.root / "sparse.old",
+    )
 
 
 class _Choice:
