@@ -25,7 +25,7 @@ FLOORS: list[tuple[str, set[str]]] = [
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
-    ("a whole run, and what is handed on after it", {"pipeline", "export"}),
+    ("a whole run, and what is done with a finished scene", {"pipeline", "export", "finished"}),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
 ]
@@ -49,7 +49,7 @@ OWNERS: dict[str, set[str]] = {
     "h5py": {"workspace", "labelled", "export"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "export", "evaluation",
+        "export", "finished", "evaluation",
     },
     "torch": {"model", "machine", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},

@@ -17,7 +17,7 @@ from corrsfm.cli.check import check
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.export import export
-from corrsfm.cli.finished import add
+from corrsfm.cli.finished import add, localize
 from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.train import train
@@ -89,8 +89,8 @@ def main(quiet: bool) -> None:
 
 
 _COMMANDS = (
-    run, extract, pairs, match, prune, reconstruct, report, add, export, check, batch, compare, evaluate,
-    bench, train,
+    run, extract, pairs, match, prune, reconstruct, report, add, localize, export, check, batch, compare,
+    evaluate, bench, train,
 )  # fmt: skip
 for _command in _COMMANDS:
     main.add_command(_command)

@@ -10,7 +10,7 @@ from corrsfm import config as cfg
 from corrsfm.cli.options import echo_json, json_option, run_options
 from corrsfm.errors import first_few
 
-__all__ = ["add"]
+__all__ = ["add", "localize"]
 
 PATH = click.Path(path_type=Path)
 
@@ -61,4 +61,58 @@ def add(
         elif not result.photos:
             click.echo("nothing to do")
     if failed:
+        raise click.exceptions.Exit(1)
+
+
+@click.command()
+@click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
+@click.argument("photos", metavar="QUERY", nargs=-1, required=True, type=PATH)
+@click.option("--csv", "csv_file", type=PATH, help="Also write the poses to this file, a line a photo.")
+@click.option(
+    "--camera-params",
+    default="",
+    help="Known intrinsics of all these photos, comma-separated in COLMAP's order; otherwise the camera that "
+    "the scene's photos of this kind share, EXIF, or what is found with the pose.",
+)
+@click.option(
+    "--camera-model", default="", help="COLMAP model of --camera-params; that of the scene if not given."
+)
+@run_options
+@json_option
+def localize(
+    workspace_dir: Path,
+    photos: tuple[Path, ...],
+    csv_file: Path | None,
+    camera_params: str,
+    camera_model: str,
+    run: cfg.RunConfig,
+    as_json: bool,
+) -> None:
+    """Find where photos were taken in a finished scene.
+
+    QUERY are photos and folders of photos. They do not join the scene, and the workspace is not changed.
+    Prints the centre of each camera in the frame of the model; --json and --csv have the poses. Ends with
+    code 1 if a photo could not be located.
+    """
+    from corrsfm.finished.localize import localize as locate
+
+    result = locate(workspace_dir, photos, camera_params=camera_params, camera_model=camera_model, run=run)
+    if csv_file is not None:
+        result.write_csv(csv_file)
+    if as_json:
+        echo_json(result.to_dict())
+    else:
+        width = max(len(photo.name) for photo in result.photos)
+        for photo in result.photos:
+            if photo.centre is None:
+                click.echo(f"{photo.name:<{width}}  not located: {photo.why_not}")
+                continue
+            x, y, z = photo.centre
+            click.echo(
+                f"{photo.name:<{width}}  centre {x:9.4f} {y:9.4f} {z:9.4f}   {photo.num_inliers} of "
+                f"{photo.num_candidates} points agree, {photo.median_error_px:.2f} px"
+                + (f", in model {photo.model}" if photo.model else "")
+            )
+        click.echo(f"{result.num_located} of {len(result.photos)} photos located")
+    if result.num_located < len(result.photos):
         raise click.exceptions.Exit(1)

@@ -276,7 +276,7 @@ def _require_photos(workspace: Workspace, incoming: Sequence[Incoming], wanted: 
         raise InputError(
             f"{folder}: photos of the interrupted addition are not there: {first_few(lost)}; name them again"
         )
-    check_hloc_keys([*read_index(workspace).names, *wanted])
+    check_hloc_keys(sorted({*read_index(workspace).names, *wanted}))
     require_readable(incoming)
 
 
@@ -320,8 +320,8 @@ class _Addition:
         self._say(prune_matches(workspace, self._options("pruned matches", cfg.PruneConfig), run))
         self._say(self._database())
         num_new_points = self._models()
-        workspace.adding.unlink(missing_ok=True)
         summary = report(workspace, html=True)
+        workspace.adding.unlink(missing_ok=True)
         return AddResult(
             photos=self._outcomes(summary),
             already_there=already,
@@ -485,24 +485,24 @@ class _Addition:
     ) -> None:
         """Write the models, what became of each photo, and the verdict on the first model as it is now."""
         workspace = self._workspace
-        with atomic_path(workspace.sparse) as temporary:
-            for number, model in enumerate(models):
-                (temporary / str(number)).mkdir(parents=True)
-                model.write_binary(temporary / str(number))
         held = {
             image.name: number
             for number, model in reversed(list(enumerate(models)))
             for image in model.images.values()
             if image.has_pose
         }
-        record = {
-            name: {
-                # An interrupted addition may have placed it before.
-                "model": held.get(name),
-                **_numbers(placed[name][1] if name in placed else last.get(name)),
-            }
-            for name in self._new
-        }
+        before = read_added(workspace)
+        record = {}
+        for name in self._new:
+            found = placed[name][1] if name in placed else last.get(name)
+            # An interrupted addition may have placed it before.
+            numbers = before.get(name, {}) if found is None else _numbers(found)
+            record[name] = {**numbers, "model": held.get(name)}
+        atomic_write_json(workspace.added, {"photos": {**before, **record}})
+        with atomic_path(workspace.sparse) as temporary:
+            for number, model in enumerate(models):
+                (temporary / str(number)).mkdir(parents=True)
+                model.write_binary(temporary / str(number))
         if workspace.evidence.exists():
             with ItemStore(workspace.features, FEATURES).reader() as load:
                 evidence = SceneEvidence(
@@ -516,7 +516,6 @@ class _Addition:
                 )
                 atomic_write_json(workspace.evidence, record_of(selection, evidence))
             logger.info("verdict: %s", selection.verdict)
-        atomic_write_json(workspace.added, {"photos": {**read_added(workspace), **record}})
 
     def _outcomes(self, summary: SceneReport) -> tuple[AddedPhoto, ...]:
         """What became of each photo, with a reason and a next step where it joined no model."""
@@ -654,10 +653,8 @@ def _colour(model: pycolmap.Reconstruction, names: Mapping[str, Resection], fold
             model.extract_colors_for_image(model.find_image_with_name(name).image_id, folder)
 
 
-def _numbers(found: Resection | None) -> dict[str, Any]:
+def _numbers(found: Resection) -> dict[str, Any]:
     """What is kept of a search for a pose."""
-    if found is None:
-        return {"num_inliers": 0, "num_candidates": 0, "median_error_px": None, "why_not": ""}
     return {
         "num_inliers": found.num_inliers,
         "num_candidates": found.num_candidates,

@@ -36,7 +36,7 @@ class Incoming:
     sha256: str
 
 
-def find_photos(paths: PhotoPaths, images_dir: Path) -> list[Incoming]:
+def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
     """The photos that paths name, sorted by name.
 
     A photo in the folder of the scene's photos keeps its name there. Any other is called by its path in the
@@ -45,8 +45,8 @@ def find_photos(paths: PhotoPaths, images_dir: Path) -> list[Incoming]:
     Parameters
     ----------
     paths : path or sequence of paths
-    images_dir : Path
-        Folder of the scene's photos.
+    images_dir : Path or None
+        Folder of the scene's photos; None if they do not join: then they are called by their paths.
 
     Raises
     ------
@@ -63,7 +63,8 @@ def find_photos(paths: PhotoPaths, images_dir: Path) -> list[Incoming]:
         else:
             raise InputError(f"{path}: no such photo or folder")
         for name, file in files:
-            photo = Incoming(name=name_in(file, images_dir) or name, path=file, sha256=sha256_of(file))
+            called = str(file) if images_dir is None else name_in(file, images_dir) or name
+            photo = Incoming(name=called, path=file, sha256=sha256_of(file))
             other = found.setdefault(photo.name, photo)
             if other.sha256 != photo.sha256:
                 raise InputError(

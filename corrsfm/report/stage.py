@@ -21,7 +21,7 @@ from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
-from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.lists import read_added, read_index, read_pairs
 from corrsfm.workspace.resume import photos_left_out, require_database
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import collect_warnings, read_warnings
@@ -83,6 +83,7 @@ def _summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconst
         versions=versions(),
         evidence=_read_record(workspace.evidence) if "models" in records else {},
         camera_remarks=_read_record(workspace.cameras_json).get("remarks", []),
+        added=[name for name, found in read_added(workspace).items() if found["model"] is not None],
     )
     return summary, models
 
