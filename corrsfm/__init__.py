@@ -8,6 +8,9 @@ costs nothing.
     check_photos(photos)                                what to know of photos before a run
     run_scene(photos, workspace, PipelineConfig())      photos → models and a report
     open_workspace(folder)                              read what the stages left there
+    check_workspace(workspace)                          what is weak about a model, and what to try next
+    add_photos(workspace, photos)                       more photos for a model that does not move
+    localize(workspace, photos)                         poses of photos that do not join
     export_scene(workspace, output, "nerfstudio")       hand the model and its photos to the next tool
     Pruner.load()(pairs)                                prune matches of your own
     correspondences_from_points(points0, points1, …)    such matches, from two arrays and two cameras
@@ -26,6 +29,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
+    from corrsfm.finished.add import AddResult, add_photos
+    from corrsfm.finished.check import WorkspaceCheck, check_workspace
+    from corrsfm.finished.localize import LocalizeResult, localize
     from corrsfm.images.check import PhotosCheck, check_photos
     from corrsfm.model import load_network
     from corrsfm.pipeline import run_scene
@@ -37,40 +43,52 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "AddResult",
     "Camera",
     "Correspondences",
     "ExportResult",
     "Features",
+    "LocalizeResult",
     "Matches",
     "PhotosCheck",
     "PipelineConfig",
     "PruneResult",
     "Pruner",
     "Scene",
+    "WorkspaceCheck",
     "__version__",
+    "add_photos",
     "check_photos",
+    "check_workspace",
     "correspondences_from_points",
     "export_scene",
     "load_network",
+    "localize",
     "open_workspace",
     "run_scene",
 ]
 
 _HOMES = {
+    "AddResult": "finished.add",
     "Camera": "types",
     "Correspondences": "types",
     "ExportResult": "export.scene",
     "Features": "types",
+    "LocalizeResult": "finished.localize",
     "Matches": "types",
     "PhotosCheck": "images.check",
     "PipelineConfig": "config",
     "PruneResult": "types",
     "Pruner": "prune.learned",
     "Scene": "workspace.scene",
+    "WorkspaceCheck": "finished.check",
+    "add_photos": "finished.add",
     "check_photos": "images.check",
+    "check_workspace": "finished.check",
     "correspondences_from_points": "prune.correspondences",
     "export_scene": "export.scene",
     "load_network": "model",
+    "localize": "finished.localize",
     "open_workspace": "workspace.scene",
     "run_scene": "pipeline",
 }

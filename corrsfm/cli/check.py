@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from corrsfm.cli.finished import show_workspace
 from corrsfm.cli.options import echo_json, json_option
 from corrsfm.errors import first_few
 
@@ -17,7 +18,7 @@ PATH = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("images_dir", metavar="IMAGES", type=PATH)
+@click.argument("images_dir", metavar="IMAGES|WORKSPACE", type=PATH)
 @click.option(
     "--keep",
     type=PATH,
@@ -27,12 +28,19 @@ PATH = click.Path(path_type=Path)
 @click.option("--threads", type=click.IntRange(0), default=0, help="Photos read at a time; 0 is all cores.")
 @json_option
 def check(images_dir: Path, keep: Path | None, threads: int, as_json: bool) -> None:
-    """Look at photos before a run.
+    """Look at photos before a run, or at a scene after it.
 
-    Finds photos that cannot be read, that are blurred, that show the same from the same place, or whose
-    exposure is far from that of the others, and says what is known of cameras. Ends with code 1 if a run
-    would stop.
+    Of photos: finds those that cannot be read, that are blurred, that show the same from the same place, or
+    whose exposure is far from that of the others, and says what is known of cameras. Ends with code 1 if a
+    run would stop.
+
+    Of a workspace: says which photos are missing or weakly held and by what, which photos would bridge the
+    parts of the scene, and what to try next, most promising first. Changes nothing. Ends with code 1 if there
+    is no model or the verdict on it is "wrong".
     """
+    if (images_dir / "workspace.json").is_file():
+        show_workspace(images_dir, as_json)
+        return
     from corrsfm.files import atomic_write_text
     from corrsfm.images.check import check_photos
     from corrsfm.machine import count_threads

@@ -10,7 +10,7 @@ from corrsfm import config as cfg
 from corrsfm.cli.options import echo_json, json_option, run_options
 from corrsfm.errors import first_few
 
-__all__ = ["add", "localize"]
+__all__ = ["add", "localize", "show_workspace"]
 
 PATH = click.Path(path_type=Path)
 
@@ -115,4 +115,39 @@ def localize(
             )
         click.echo(f"{result.num_located} of {len(result.photos)} photos located")
     if result.num_located < len(result.photos):
+        raise click.exceptions.Exit(1)
+
+
+def show_workspace(workspace_dir: Path, as_json: bool) -> None:
+    """What `corrsfm check` prints of a workspace; raises Exit if its model is not fit to be used."""
+    from corrsfm.finished.check import check_workspace
+
+    result = check_workspace(workspace_dir)
+    if as_json:
+        echo_json(result.to_dict())
+    else:
+        click.echo(f"{workspace_dir}: {result.num_registered} of {result.num_photos} photos registered")
+        if result.verdict:
+            click.echo(f"verdict: {result.verdict}")
+        weak = [photo for photo in result.photos if photo.weakness]
+        if weak:
+            width = max(len(photo.name) for photo in weak)
+            click.echo(f"{'weakly held':<{width}}  pairs  points")
+            for photo in weak:
+                click.echo(
+                    f"{photo.name:<{width}}  {photo.num_pairs:>5}  {photo.num_points:>6}  {photo.weakness}"
+                )
+        if len(result.parts) > 1:
+            sizes = ", ".join(str(len(part)) for part in result.parts)
+            click.echo(f"parts of the pair graph: {sizes} photos; pairs that come nearest to bridging them:")
+            for bridge in result.bridges:
+                kept = f"{bridge.num_kept} of {bridge.num_putative} matches kept"
+                click.echo(f"  {bridge.name0} – {bridge.name1}: {kept}")
+        for lost in result.missing:
+            click.echo(f"missing: {lost.name}: {lost.reason}: {lost.detail}")
+        for number, finding in enumerate(result.findings, start=1):
+            click.echo(f"{number}. {finding.text}\n   next: {finding.next_step}")
+        if not result.findings:
+            click.echo("nothing to object to")
+    if not result.is_usable:
         raise click.exceptions.Exit(1)
