@@ -102,8 +102,15 @@ class SceneEvidence:
 
     def count_predicted(self, views: Views) -> int:
         """Matches that a model predicts; the neighbours of features are computed when first needed."""
-        predicted = predict(views, self.keypoints, self._tables, self._pairs)
-        return sum(len(matches) for matches in predicted.values())
+        return sum(len(matches) for matches in self.predicted(views).values())
+
+    def predicted(self, views: Views) -> dict[Pair, NDArray[np.int32]]:
+        """The same matches, (K, 2) keypoint indices for each pair of registered photos that is counted."""
+        return predict(views, self.keypoints, self._tables, self._pairs)
+
+    def features(self, photo: str) -> Features:
+        """Keypoints and descriptors of a photo."""
+        return self._load(photo)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

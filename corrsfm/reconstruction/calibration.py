@@ -19,6 +19,7 @@ __all__ = [
     "has_possible_cameras",
     "has_prior_focal_lengths",
     "is_plausible",
+    "refine",
     "refine_intrinsics",
 ]
 
@@ -110,6 +111,11 @@ def refine_intrinsics(
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = refine_principal_point
     options.ceres.solver_options.num_threads = num_threads or -1
+    refine(model, options)
+
+
+def refine(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Adjust a whole model in place a few times, and drop the points that no longer fit in between."""
     for _ in range(_REFINEMENTS):
         adjust(model, options)
         pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG)
