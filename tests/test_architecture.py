@@ -26,8 +26,8 @@ FLOORS: list[tuple[str, set[str]]] = [
     ("the arithmetic of the stages, which knows no workspace", {*STAGES, "labelled"}),
     ("the stages, files to files", {f"{stage}.stage" for stage in STAGES}),
     (
-        "a whole run, its forecast, and what comes in before and is handed on after it",
-        {"pipeline", "forecast", "importing", "export"},
+        "a whole run, its forecast, what comes in before it, and what is done with a finished scene",
+        {"pipeline", "forecast", "importing", "export", "finished"},
     ),
     ("many runs, measuring, training", {"batch", "evaluation", "training"}),
     ("the command line", {"cli", "__main__"}),
@@ -52,7 +52,7 @@ OWNERS: dict[str, set[str]] = {
     "h5py": {"workspace", "labelled", "importing", "export"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
-        "export", "evaluation",
+        "export", "finished", "evaluation",
     },
     "torch": {"model", "machine", "features", "matches", "prune", "training", "evaluation"},
     "click": {"cli"},

@@ -17,6 +17,7 @@ from corrsfm.cli.check import check
 from corrsfm.cli.compare import compare
 from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.export import export
+from corrsfm.cli.finished import add, localize
 from corrsfm.cli.importing import import_
 from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
@@ -89,8 +90,8 @@ def main(quiet: bool) -> None:
 
 
 _COMMANDS = (
-    run, extract, import_, pairs, match, prune, reconstruct, report, export, check, batch, compare, evaluate,
-    bench, train,
+    run, extract, import_, pairs, match, prune, reconstruct, report, add, localize, export, check, batch,
+    compare, evaluate, bench, train,
 )  # fmt: skip
 for _command in _COMMANDS:
     main.add_command(_command)

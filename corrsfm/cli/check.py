@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 
+from corrsfm.cli.finished import show_workspace
 from corrsfm.cli.options import echo_json, json_option
 from corrsfm.errors import CorrsfmError, first_few
 
@@ -21,7 +22,7 @@ PATH = click.Path(path_type=Path)
 
 
 @click.command()
-@click.argument("photos", metavar="PHOTOS...", nargs=-1, required=True, type=PATH)
+@click.argument("photos", metavar="PHOTOS...|WORKSPACE", nargs=-1, required=True, type=PATH)
 @click.option(
     "--keep",
     type=PATH,
@@ -45,12 +46,19 @@ def check(
     threads: int,
     as_json: bool,
 ) -> None:
-    """Look at photos before a run.
+    """Look at photos before a run, or at a scene after it.
 
-    Finds photos that cannot be read, that are blurred, that show the same from the same place, or whose
-    exposure is far from that of the others, and masks that do not fit, and says what is known of cameras and
-    what a run will cost. Ends with code 1 if a run would stop.
+    Of photos: finds those that cannot be read, that are blurred, that show the same from the same place, or
+    whose exposure is far from that of the others, and masks that do not fit, and says what is known of
+    cameras and what a run will cost. Ends with code 1 if a run would stop.
+
+    Of a workspace: says which photos are missing or weakly held and by what, which photos would bridge the
+    parts of the scene, and what to try next, most promising first. Changes nothing. Ends with code 1 if there
+    is no model or the verdict on it is "wrong".
     """
+    if len(photos) == 1 and (photos[0] / "workspace.json").is_file():
+        show_workspace(photos[0], as_json)
+        return
     from corrsfm.config import PipelineConfig, RunConfig
     from corrsfm.files import atomic_write_text
     from corrsfm.images.check import check_photos

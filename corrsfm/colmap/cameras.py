@@ -42,12 +42,12 @@ def to_pycolmap(camera: Camera, camera_id: int = 1) -> pycolmap.Camera:
     )
 
 
-def write_camera(database: pycolmap.Database, camera: pycolmap.Camera) -> int:
-    """Write a camera and the rig that COLMAP wants around it; the new id of both."""
+def write_camera(database: pycolmap.Database, camera: pycolmap.Camera, *, keep_id: bool = False) -> int:
+    """Write a camera and the rig that COLMAP wants around it; the id of both, a new one unless it is kept."""
     import pycolmap
 
     written = copy.copy(camera)
-    written.camera_id = database.write_camera(written)
+    written.camera_id = database.write_camera(written, use_camera_id=keep_id)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(written.sensor_id)
     rig.rig_id = written.camera_id

@@ -29,7 +29,7 @@ from corrsfm.workspace.resume import StageOutcome, explain, finish
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
 
-__all__ = ["verify_matches"]
+__all__ = ["fingerprint_of", "verify_matches"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -47,16 +47,7 @@ def verify_matches(
     index = read_index(workspace)
     pruned = workspace.require("pruned matches")
     voting = _cameras_that_vote(workspace, index)
-    fingerprint = config_hash(
-        "verified matches",
-        pycolmap_version(),
-        pruned.fingerprint,
-        index.cameras,
-        config,
-        run.seed,
-        # Where no camera votes, finished work of version 0.1.0 stays valid.
-        *([VOTES_VERSION] if voting else []),
-    )
+    fingerprint = fingerprint_of(workspace, config, run.seed)
     pair_list = read_pairs(workspace)
     damaged = workspace.database.is_file() and is_truncated(workspace.database)
     if damaged:
@@ -95,6 +86,21 @@ def verify_matches(
     )
     finish(workspace, outcome, fingerprint, config, inputs={"pruned matches": pruned.fingerprint})
     return outcome
+
+
+def fingerprint_of(workspace: Workspace, config: cfg.DatabaseConfig, seed: int) -> str:
+    """What the record of the stage must carry to be current."""
+    index = read_index(workspace)
+    return config_hash(
+        "verified matches",
+        pycolmap_version(),
+        workspace.require("pruned matches").fingerprint,
+        index.cameras,
+        config,
+        seed,
+        # Where no camera votes, finished work of version 0.1.0 stays valid.
+        *([VOTES_VERSION] if _cameras_that_vote(workspace, index) else []),
+    )
 
 
 def _cameras_that_vote(workspace: Workspace, index: Index) -> list[tuple[int, ...]]:

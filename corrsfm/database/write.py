@@ -7,23 +7,23 @@ is `pycolmap.geometric_verification`, which estimates geometries from the stored
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import to_pycolmap, write_camera
+from corrsfm.colmap.cameras import camera_from_pycolmap, to_pycolmap, write_camera
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors, is_sqlite
+from corrsfm.colmap.sqlite import copy_database, database_errors, is_sqlite
 from corrsfm.config import DatabaseConfig
 from corrsfm.database.verification import default_verification_error_px, verify_pairs
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord
 
-__all__ = ["write_database"]
+__all__ = ["add_to_database", "write_database"]
 
 
 def write_database(
@@ -76,6 +76,91 @@ def write_database(
         with colmap_log(log_file), database_errors(temporary, path):
             max_error_px = config.verification_error_px or default_verification_error_px(cameras)
             verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
+
+
+def add_to_database(
+    path: Path,
+    *,
+    images: Sequence[ImageRecord],
+    cameras: Mapping[str, tuple[int, Camera]],
+    features: Callable[[str], Features],
+    kept: Iterable[tuple[str, str, NDArray[np.int32]]],
+    config: DatabaseConfig,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+) -> None:
+    """Add photos and pairs to a database and verify the pairs; what is there already stays as it is.
+
+    Photos and pairs that the database holds are passed over, so doing it twice is doing it once.
+
+    Parameters
+    ----------
+    path : Path
+        Changed as a whole or not at all.
+    images : sequence of ImageRecord
+    cameras : mapping of str to (int, Camera)
+        Photo → the id of its camera, and the camera to write if the database has none of this id.
+    features, kept, config, seed, num_threads, log_file
+        As for `write_database`.
+
+    Raises
+    ------
+    InputError
+        As `write_database`.
+    DatabaseError
+        If the database cannot be read or written, or is in use.
+    """
+    _check_not_in_use(path)
+    with atomic_path(path) as temporary:
+        copy_database(path, temporary)
+        with colmap_log(), database_errors(temporary, path):
+            sizes = _append(temporary, images, cameras, features, kept, config.write_descriptors)
+        with colmap_log(log_file), database_errors(temporary, path):
+            max_error_px = config.verification_error_px or default_verification_error_px(sizes)
+            # Pairs that were verified before have a geometry, and those are passed over.
+            verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
+
+
+def _append(
+    path: Path,
+    images: Sequence[ImageRecord],
+    cameras: Mapping[str, tuple[int, Camera]],
+    features: Callable[[str], Features],
+    kept: Iterable[tuple[str, str, NDArray[np.int32]]],
+    write_descriptors: bool,
+) -> list[Camera]:
+    """Write what is new; all cameras."""
+    with pycolmap.Database.open(path) as database:
+        transaction = pycolmap.DatabaseTransaction(database)
+        try:
+            image_ids = {image.name: image.image_id for image in database.read_all_images()}
+            for image in sorted(images, key=lambda image: image.name):
+                if image.name in image_ids:
+                    continue
+                camera_id, camera = cameras[image.name]
+                if not database.exists_camera(camera_id):
+                    write_camera(database, to_pycolmap(camera, camera_id), keep_id=True)
+                image_ids[image.name] = _write_image(database, image, camera_id)
+                _write_features(
+                    database, image_ids[image.name], image.name, features(image.name), write_descriptors
+                )
+            num_keypoints = {
+                name: database.num_keypoints_for_image(image_id) for name, image_id in image_ids.items()
+            }
+            _write_pairs(
+                database,
+                image_ids,
+                num_keypoints,
+                (
+                    (name0, name1, indices)
+                    for name0, name1, indices in kept
+                    if not database.exists_matches(image_ids[name0], image_ids[name1])
+                ),
+            )
+            return [camera_from_pycolmap(camera) for camera in database.read_all_cameras()]
+        finally:
+            del transaction
 
 
 def _check_not_in_use(path: Path) -> None:

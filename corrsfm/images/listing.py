@@ -31,6 +31,7 @@ def list_images(
     image_list: Path | None = None,
     mask_dir: Path | None = None,
     chosen: Sequence[str] | None = None,
+    at_least: int = 2,
 ) -> list[str]:
     """Names of the photos in a folder and its sub-folders, sorted.
 
@@ -46,17 +47,19 @@ def list_images(
         ``NAME.png`` beside a photo ``NAME`` is not a photo. A list overrules this.
     chosen : sequence of str, optional
         Names to choose from, in place of everything in the folder.
+    at_least : int
+        Photos that there must be: two for a scene of their own.
 
     Returns
     -------
     list of str
-        Posix paths relative to the folder, at least two.
+        Posix paths relative to the folder.
 
     Raises
     ------
     InputError
-        If the folder or the list cannot be read, the list names photos that do not exist, or fewer than two
-        photos remain.
+        If the folder or the list cannot be read, the list names photos that do not exist, or too few photos
+        remain.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; expected the folder with the photos")
@@ -82,13 +85,12 @@ def list_images(
             f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot:"
             f" {first_few(map(ascii, separating))}; rename them"
         )
-    if len(names) < 2:
+    if len(names) < at_least:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
         if videos := [name for name in files if name.lower().endswith(VIDEO_SUFFIXES)]:
             found += f"; to use a video give it in place of its folder: {folder / videos[0]}"
-        raise InputError(
-            f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
-        )
+        needed = "at least two overlapping photos are needed" if at_least > 1 else "expected photos"
+        raise InputError(f"{where}: {found}; {needed} ({', '.join(IMAGE_SUFFIXES)})")
     return sorted(names)
 
 

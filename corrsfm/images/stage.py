@@ -29,7 +29,7 @@ from corrsfm.workspace.lists import Index, read_index, write_index
 from corrsfm.workspace.resume import StageOutcome, finish
 from corrsfm.workspace.warned import keeps_warnings
 
-__all__ = ["index_photos"]
+__all__ = ["fingerprint_of", "index_photos"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -100,7 +100,7 @@ def index_photos(
     for names in duplicate_images(records):
         logger.warning("photos with the same content: %s", ", ".join(names))
     index = Index(records=tuple(records), cameras=tuple(cameras))
-    fingerprint = config_hash("images", index.records, index.cameras)
+    fingerprint = fingerprint_of(index)
     _explain_photos(workspace, index)
     if not workspace.is_current("images", fingerprint, workspace.images_json, workspace.images_txt):
         workspace.forget("images")
@@ -109,6 +109,11 @@ def index_photos(
     outcome = StageOutcome(stage="images", num_items=len(records), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config)
     return outcome
+
+
+def fingerprint_of(index: Index) -> str:
+    """What the record of the stage must carry to be current."""
+    return config_hash("images", index.records, index.cameras)
 
 
 def _explain_photos(workspace: Workspace, index: Index) -> None:

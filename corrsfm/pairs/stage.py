@@ -16,12 +16,12 @@ from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.imported import imported_from, record_imported_pairs
-from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
+from corrsfm.workspace.lists import Index, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
 
-__all__ = ["make_pairs"]
+__all__ = ["fingerprint_of", "make_pairs"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -39,10 +39,9 @@ def make_pairs(
     features = workspace.require("features")
     if (source := imported_from(workspace, "pairs")) is not None:
         return _keep_imported(workspace, source, index.names)
-    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
-    order = ["in the order of time"] if workspace.is_sequence else []
-    photos = [[r.name, r.gps] for r in index.records]
-    fingerprint = config_hash("pairs", config, run.seed, photos, features.fingerprint, *files, *order)
+    fingerprint = fingerprint_of(
+        index, features.fingerprint, config, run.seed, is_sequence=workspace.is_sequence
+    )
     left_out = photos_left_out(workspace, index.names)
     records = [record for record in index.records if record.name not in left_out]
     if len(records) < 2:
@@ -58,7 +57,7 @@ def make_pairs(
     explain(workspace, "pairs", config)
     with ItemStore(workspace.features, FEATURES).reader() as read:
         # A list or a model may name photos that were left out.
-        candidates = index.records if files else records
+        candidates = index.records if config.pairs_file or config.covisible_model else records
         pair_list = _without(
             left_out,
             strategies.make_pairs(
@@ -84,6 +83,16 @@ def _keep_imported(workspace: Workspace, source: cfg.ImportedConfig, names: list
     _warn_if_disconnected(names, pair_list)
     record_imported_pairs(workspace, pair_list, source)
     return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
+
+
+def fingerprint_of(
+    index: Index, features: str, config: cfg.PairsConfig, seed: int, *, is_sequence: bool
+) -> str:
+    """What the record of the stage must carry to be current; ``features`` is the fingerprint of theirs."""
+    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
+    order = ["in the order of time"] if is_sequence else []
+    photos = [[r.name, r.gps] for r in index.records]
+    return config_hash("pairs", config, seed, photos, features, *files, *order)
 
 
 def _without(names: set[str], pair_list: PairList) -> PairList:

@@ -30,6 +30,7 @@ __all__ = [
     "make_pairs",
     "natural_order",
     "num_pairs_expected",
+    "pairs_of_new_photos",
     "read_pairs_file",
     "retrieval_pairs",
     "sequential_pairs",
@@ -235,6 +236,45 @@ def retrieval_pairs(
     vectors = global_vectors(names, lambda name: load_features(name).descriptors, seed=seed)
     neighbours = most_similar(vectors, num_retrieved)
     return {_ordered(i, int(j)) for i, found in enumerate(neighbours) for j in found}
+
+
+def pairs_of_new_photos(
+    known: Sequence[str],
+    new: Sequence[str],
+    num_retrieved: int,
+    *,
+    load_features: Callable[[str], Features],
+    seed: int,
+) -> set[tuple[str, str]]:
+    """Photos that come later with those that are there, and with each other.
+
+    Parameters
+    ----------
+    known, new : sequence of str
+        Names without repetition.
+    num_retrieved : int
+        Most similar photos paired with each new photo, where there are more than 200 photos; else all.
+    load_features : callable
+        Name → features, of all photos.
+    seed : int
+
+    Returns
+    -------
+    set of Pair
+        Each with its smaller name first.
+    """
+    names = sorted({*known, *new})
+    if len(names) <= MAX_EXHAUSTIVE_PHOTOS:
+        proposed = {_ordered_names(one, other) for one in new for other in names if one != other}
+    else:
+        indices = retrieval_pairs(names, num_retrieved, load_features=load_features, seed=seed)
+        proposed = {(names[i], names[j]) for i, j in indices}
+    fresh = set(new)
+    return {pair for pair in proposed if not fresh.isdisjoint(pair)}
+
+
+def _ordered_names(one: str, other: str) -> tuple[str, str]:
+    return (one, other) if one < other else (other, one)
 
 
 def spatial_pairs(records: Sequence[ImageRecord], num_neighbours: int, max_distance_m: float) -> IndexPairs:

@@ -43,7 +43,7 @@ from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
 from corrsfm.reconstruction.views import Views, rays_of, views_of
 from corrsfm.types import Features, Pair
 
-__all__ = ["SceneEvidence", "Selection", "policy_for", "select_model"]
+__all__ = ["SceneEvidence", "Selection", "judge_as_it_is", "policy_for", "select_model"]
 
 FIRST = "first"
 _MENDED = "+mended"
@@ -103,8 +103,15 @@ class SceneEvidence:
 
     def count_predicted(self, views: Views) -> int:
         """Matches that a model predicts; the neighbours of features are computed when first needed."""
-        predicted = predict(views, self.keypoints, self._tables, self._pairs)
-        return sum(len(matches) for matches in predicted.values())
+        return sum(len(matches) for matches in self.predicted(views).values())
+
+    def predicted(self, views: Views) -> dict[Pair, NDArray[np.int32]]:
+        """The same matches, (K, 2) keypoint indices for each pair of registered photos that is counted."""
+        return predict(views, self.keypoints, self._tables, self._pairs)
+
+    def features(self, photo: str) -> Features:
+        """Keypoints and descriptors of a photo."""
+        return self._load(photo)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -325,6 +332,30 @@ def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first
         verdict=_verdict(attempt.model, choice, len(evidence.names), attempt.evidence),
         folds=attempt.evidence,
         left_out=attempt.removed,
+    )
+
+
+def judge_as_it_is(
+    model: pycolmap.Reconstruction, evidence: SceneEvidence, *, name: str, reason: str
+) -> Selection:
+    """The verdict on a model without looking for a better one.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    evidence : SceneEvidence
+    name, reason : str
+        What to call it in the record, and why nothing else was tried.
+    """
+    views = views_of(model)
+    chosen = Tried(name=name, views=views, explained=evidence.explain(views), seconds=0.0)
+    choice = Choice(chosen=chosen, tried=(chosen,), reason=reason)
+    folds = judge_model(model, evidence.verified).evidence
+    return Selection(
+        model=model,
+        choice=choice,
+        verdict=_verdict(model, choice, len(evidence.names), folds),
+        folds=folds,
     )
 
 

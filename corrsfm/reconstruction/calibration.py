@@ -20,6 +20,7 @@ __all__ = [
     "has_possible_cameras",
     "has_prior_focal_lengths",
     "is_plausible",
+    "refine",
     "refine_intrinsics",
     "thinned",
 ]
@@ -115,6 +116,11 @@ def refine_intrinsics(
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = refine_principal_point
     options.ceres.solver_options.num_threads = num_threads or -1
+    refine(model, options)
+
+
+def refine(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:
+    """Adjust a whole model in place a few times, and drop the points that no longer fit in between."""
     for _ in range(_REFINEMENTS):
         adjust(model, options)
         pycolmap.ObservationManager(model).filter_all_points3D(_MAX_ERROR_PX, _MIN_ANGLE_DEG)
@@ -122,17 +128,20 @@ def refine_intrinsics(
 
 
 def adjust(
-    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    problem: pycolmap.BundleAdjustmentConfig | None = None,
 ) -> pycolmap.BundleAdjustmentSummary:
-    """Adjust a whole model in place, without the summary in the terminal.
+    """Adjust a whole model in place, or what a problem says, without the summary in the terminal.
 
     `pycolmap.bundle_adjustment` does the same but logs to the terminal.
     """
     options.print_summary = False
-    problem = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
-        problem.add_image(image_id)
-    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if problem is None:
+        problem = pycolmap.BundleAdjustmentConfig()
+        for image_id in model.reg_image_ids():
+            problem.add_image(image_id)
+        problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     return pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
 
 

@@ -41,6 +41,7 @@ def reconstruct(
     log_file: Path | None = None,
     on_progress: Callable[[int], None] | None = None,
     choose: Callable[[pycolmap.Reconstruction | None, float], pycolmap.Reconstruction | None] | None = None,
+    join: Callable[[list[pycolmap.Reconstruction]], list[pycolmap.Reconstruction]] | None = None,
 ) -> list[ModelSummary]:
     """Map a database into models; they appear at ``output`` all at once or not at all.
 
@@ -67,6 +68,9 @@ def reconstruct(
     choose : callable, optional
         Given the largest model, None if there is none, and the seconds it took: the model to put in its
         place. Not asked if the time limit stopped mapping.
+    join : callable, optional
+        Given all models if there are several, the largest first: those to keep. Not asked if the time limit
+        stopped mapping.
 
     Returns
     -------
@@ -109,6 +113,8 @@ def reconstruct(
             models = [chosen, *(model for model in models[1:] if not _names(model) <= _names(chosen))]
         if not models:
             raise ReconstructionError(f"{database}: {why_no_model(graph, cut_off)}")
+        if join is not None and len(models) > 1 and not cut_off:
+            models = join(models)
         if cut_off:
             logger.warning("%s; photos may be missing for that reason alone", cut_off)
         for number, model in enumerate(models):

@@ -6,6 +6,8 @@ import functools
 import logging
 import shutil
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,16 +18,18 @@ from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
 from corrsfm.errors import ReconstructionError, first_few
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
-from corrsfm.reconstruction.best_model import SceneEvidence, policy_for, select_model
+from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, policy_for, select_model
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
+from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.record import record_of
+from corrsfm.types import Features
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
-from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.lists import read_added, read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
@@ -33,7 +37,7 @@ from corrsfm.workspace.warned import keeps_warnings
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["reconstruct"]
+__all__ = ["fingerprint_of", "reconstruct"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -51,15 +55,18 @@ def reconstruct(
     """
     started = time.monotonic()
     verified = require_database(workspace)
-    fingerprint = config_hash("models", pycolmap_version(), verified.fingerprint, config, run.seed)
+    fingerprint = fingerprint_of(verified.fingerprint, config, run.seed)
     # Models without colours are remade once the photos are back.
     black = config_hash("black", fingerprint)
     images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
     current = [fingerprint] if images_dir else [fingerprint, black]
     if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
+        if added := read_added(workspace):
+            logger.info("models: %d photos were added to them without mapping again; kept", len(added))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
+    _keep_grown_models(workspace)
     workspace.forget("models")
     names = read_index(workspace).names
     if images_dir is None:
@@ -71,9 +78,13 @@ def reconstruct(
         )
     _warn_of_parts(workspace, names)
     workspace.evidence.unlink(missing_ok=True)
-    choice = _Choice(workspace, names, config, run, workspace.candidates / fingerprint[:16])
     chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
-    with tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar:
+    features = ItemStore(workspace.features, FEATURES)
+    with (
+        features.reader() if chooses or config.join_models else nullcontext(_no_features) as load,
+        tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar,
+    ):
+        choice = _Choice(workspace, names, load, config, run, workspace.candidates / fingerprint[:16])
         try:
             models = map_database(
                 workspace.database,
@@ -85,15 +96,45 @@ def reconstruct(
                 log_file=workspace.log,
                 on_progress=functools.partial(_show_progress, bar),
                 choose=choice if chooses else None,
+                join=choice.join if config.join_models else None,
             )
         except ReconstructionError:
             workspace.put_models_aside()
             raise
     if choice.record is not None:
         atomic_write_json(workspace.evidence, choice.record)
+    for path in (workspace.added, workspace.adding):
+        path.unlink(missing_ok=True)
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
     finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
     return outcome
+
+
+def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -> str:
+    """What the record of the stage must carry to be current; ``verified`` is that of the verified matches."""
+    return config_hash("models", pycolmap_version(), verified, config, seed)
+
+
+def _keep_grown_models(workspace: Workspace) -> None:
+    """Before all is mapped again: say what that means for photos that were added, and keep a copy."""
+    if workspace.adding.exists():
+        logger.warning(
+            "an addition of photos was not finished; all photos are mapped again instead, and every pose "
+            "moves; to finish it instead, stop and run: corrsfm add %s",
+            workspace.root,
+        )
+    added = read_added(workspace)
+    if not added or not workspace.sparse.is_dir():
+        return
+    with atomic_path(workspace.root / "sparse.old") as copy:
+        shutil.copytree(workspace.sparse, copy)
+    logger.warning(
+        "%d photos had been added to the models without moving the others (%s); all photos are mapped again "
+        "now and every pose moves; the models so far are kept in %s",
+        len(added),
+        first_few(added),
+        workspace.root / "sparse.old",
+    )
 
 
 class _Choice:
@@ -103,12 +144,14 @@ class _Choice:
         self,
         workspace: Workspace,
         names: list[str],
+        load: Callable[[str], Features],
         config: cfg.ReconstructionConfig,
         run: cfg.RunConfig,
         workdir: Path,
     ) -> None:
         self._workspace = workspace
         self._names = names
+        self._load = load
         self._config = config
         self._run = run
         self._workdir = workdir
@@ -122,24 +165,20 @@ class _Choice:
         for folder in workspace.candidates.glob("*"):
             if folder != self._workdir:
                 shutil.rmtree(folder)
-        with ItemStore(workspace.features, FEATURES).reader() as load:
-            evidence = SceneEvidence(
-                self._names, read_verified_matches(workspace.database), load, seed=run.seed
-            )
-            selection = select_model(
-                first,
-                evidence,
-                workspace.database,
-                self._workdir,
-                policy=policy_for(self._config.max_models_tried, seconds),
-                first_seconds=seconds,
-                seed=run.seed,
-                cameras_on_trial=self._cameras_on_trial(),
-                refine_principal_point=self._config.refine_principal_point,
-                num_processes=count_threads(run.threads),
-                unfold=self._config.unfold,
-            )
-            self.record = None if selection is None else record_of(selection, evidence)
+        selection = select_model(
+            first,
+            self._evidence,
+            workspace.database,
+            self._workdir,
+            policy=policy_for(self._config.max_models_tried, seconds),
+            first_seconds=seconds,
+            seed=run.seed,
+            cameras_on_trial=self._cameras_on_trial(),
+            refine_principal_point=self._config.refine_principal_point,
+            num_processes=count_threads(run.threads),
+            unfold=self._config.unfold,
+        )
+        self.record = None if selection is None else record_of(selection, self._evidence)
         if workspace.candidates.is_dir():
             shutil.rmtree(workspace.candidates)
         if selection is None:
@@ -154,11 +193,43 @@ class _Choice:
         logger.info("verdict: %s", selection.verdict)
         return selection.model
 
+    @functools.cached_property
+    def _evidence(self) -> SceneEvidence:
+        verified = read_verified_matches(self._workspace.database)
+        return SceneEvidence(self._names, verified, self._load, seed=self._run.seed)
+
+    def join(self, models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+        """Join what can be joined of several models; what was tried goes into the record."""
+        left, attempts = join_models(
+            models,
+            self._workspace.database,
+            self._evidence,
+            seed=self._run.seed,
+            refine_intrinsics=self._config.refine_intrinsics,
+            refine_principal_point=self._config.refine_principal_point,
+            num_threads=count_threads(self._run.threads),
+        )
+        for attempt in attempts:
+            logger.info("%s", attempt)
+        if left[0] is not models[0]:
+            selection = judge_as_it_is(
+                left[0], self._evidence, name="joined", reason="models of parts of the scene were joined"
+            )
+            self.record = record_of(selection, self._evidence)
+            logger.info("verdict: %s", selection.verdict)
+        if self.record is not None:
+            self.record["joinings"] = [attempt.to_dict() for attempt in attempts]
+        return left
+
     def _cameras_on_trial(self) -> StartingCameras | None:
         """Other cameras to try; none where the user said which photos share one."""
         if self._workspace.require("images").config["camera_mode"] != cfg.CameraMode.AUTO:
             return None
         return find_cameras_on_trial(self._workspace.database)
+
+
+def _no_features(photo: str) -> Features:
+    raise AssertionError(f"the features of {photo} are needed by the choice of a model only")
 
 
 def _show_progress(bar: tqdm, num_registered: int) -> None:

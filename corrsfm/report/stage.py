@@ -21,7 +21,7 @@ from corrsfm.types import Pair, PairStatistics
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
-from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.lists import read_added, read_index, read_pairs
 from corrsfm.workspace.resume import photos_left_out, require_database
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import collect_warnings, read_warnings
@@ -29,7 +29,7 @@ from corrsfm.workspace.warned import collect_warnings, read_warnings
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["report"]
+__all__ = ["report", "summarise"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -40,7 +40,7 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     Without models the report says why there are none. Models of earlier matches are left out.
     """
     with collect_warnings() as met:
-        summary, models = _summarise(workspace)
+        summary, models = summarise(workspace)
     kept = read_warnings(workspace.warnings_json)
     said = [*((stage, kept.get(stage, [])) for stage in STAGE_COMMANDS), ("report", met)]
     summary = dataclasses.replace(
@@ -62,7 +62,7 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     return summary
 
 
-def _summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstruction]]:
+def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstruction]]:
     """The statistics of a workspace, and its models if they are of its current matches."""
     require_database(workspace)
     records = {stage: record for stage in STAGE_COMMANDS if (record := workspace.record_of(stage))}
@@ -83,6 +83,7 @@ def _summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconst
         versions=versions(),
         evidence=_read_record(workspace.evidence) if "models" in records else {},
         camera_remarks=_read_record(workspace.cameras_json).get("remarks", []),
+        added=[name for name, found in read_added(workspace).items() if found["model"] is not None],
     )
     return summary, models
 

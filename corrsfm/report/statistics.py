@@ -66,6 +66,8 @@ class SceneReport:
         Which photos share a camera and by what evidence, where EXIF did not tell.
     warnings : tuple of StageWarning
         In the order of the stages.
+    added : tuple of str
+        Photos that joined finished models which were not moved for them, sorted.
     """
 
     scene: str
@@ -80,6 +82,7 @@ class SceneReport:
     evidence: dict[str, Any] = dataclasses.field(default_factory=dict)
     camera_remarks: tuple[str, ...] = ()
     warnings: tuple[StageWarning, ...] = ()
+    added: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -181,6 +184,7 @@ def make_report(
     evidence: Mapping[str, Any] | None = None,
     camera_remarks: Iterable[str] = (),
     warnings: Iterable[StageWarning] = (),
+    added: Iterable[str] = (),
 ) -> SceneReport:
     """Build the report of a scene and find out why photos are missing.
 
@@ -202,6 +206,7 @@ def make_report(
         See `SceneReport`.
     camera_remarks : iterable of str, optional
     warnings : iterable of StageWarning, optional
+    added : iterable of str, optional
 
     Returns
     -------
@@ -225,6 +230,7 @@ def make_report(
         evidence=dict(evidence or {}),
         camera_remarks=tuple(camera_remarks),
         warnings=tuple(warnings),
+        added=tuple(sorted(added)),
     )
 
 

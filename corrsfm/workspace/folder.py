@@ -17,6 +17,8 @@
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
     ├── evidence.json       why the first model was chosen, and the verdict on it
+    ├── added.json          photos that `corrsfm add` put into finished models, and what became of each
+    ├── adding.json         those of an addition that has not finished
     ├── sparse.old/         models of earlier matches, moved here when mapping failed
     ├── warnings.json       what each stage warned of
     ├── report.json, report.html
@@ -36,6 +38,7 @@ import fcntl
 import json
 import logging
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Iterator, Sequence
@@ -122,6 +125,8 @@ class Workspace:
         self.database = root / "database.db"
         self.sparse = root / "sparse"
         self.evidence = root / "evidence.json"
+        self.added = root / "added.json"
+        self.adding = root / "adding.json"
         self.candidates = root / ".candidates"
         self.warnings_json = root / "warnings.json"
         self.seeds = root / ".seeds"
@@ -209,6 +214,27 @@ class Workspace:
             self._values = self._load()
             yield
 
+    @contextlib.contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read the workspace while nobody writes there; it is not changed, and may be read-only.
+
+        Raises
+        ------
+        WorkspaceError
+            If another process works there.
+        """
+        with contextlib.ExitStack() as stack:
+            with contextlib.suppress(OSError):
+                handle = stack.enter_context(open(self.root / ".lock", encoding="utf-8"))
+                try:
+                    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                except BlockingIOError as error:
+                    raise WorkspaceError(
+                        f"{self.root}: another corrsfm works in this workspace; wait for it"
+                    ) from error
+            self._values = self._load()
+            yield
+
     @property
     def images_dir(self) -> Path:
         """Folder of the photos.
@@ -272,14 +298,20 @@ class Workspace:
         """
         record = self.record_of(stage)
         if record is None:
-            raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self.command_for(stage)}")
+            raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self._remedy(stage)}")
         for name, fingerprint in record.inputs.items():
             if self.require(name).fingerprint != fingerprint:
                 raise WorkspaceError(
                     f"{self.root}: {label_of(stage)} are older than {label_of(name)};"
-                    f" run: {self.command_for(stage)}"
+                    f" run: {self._remedy(stage)}"
                 )
         return record
+
+    def _remedy(self, stage: str) -> str:
+        """The command that makes a stage current; an addition that was interrupted is finished first."""
+        if self.adding.exists():
+            return shlex.join(["corrsfm", "add", str(self.root)])
+        return self.command_for(stage)
 
     def current_record_of(self, stage: str) -> StageRecord | None:
         """The record of a stage if its inputs have not changed since; else None."""

@@ -18,6 +18,7 @@ from corrsfm.workspace.folder import Workspace
 
 __all__ = [
     "Index",
+    "read_added",
     "read_index",
     "read_pairs",
     "write_index",
@@ -83,6 +84,19 @@ def read_index(workspace: Workspace) -> Index:
             f"{path}: damaged ({error}); make it again with: {workspace.command_for('images')}"
         ) from error
     return Index(records=records, cameras=cameras)
+
+
+def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
+    """Photos that were put into finished models, and what is known of each; empty if there are none."""
+    try:
+        return dict(json.loads(workspace.added.read_text(encoding="utf-8"))["photos"])
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise WorkspaceError(
+            f"{workspace.added}: damaged ({error}); delete it: what it says of added photos is lost, the "
+            "models are not"
+        ) from error
 
 
 def _tuples(entry: dict[str, Any], key: str) -> dict[str, Any]:

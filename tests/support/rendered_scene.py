@@ -13,15 +13,15 @@ CONFIG = cfg.PipelineConfig(
 )
 
 
-def render_scene(folder: Path) -> tuple[Path, Path]:
-    """Write four photos to ``images`` and their cameras to ``truth``; return both folders."""
+def render_scene(folder: Path, num_photos: int = 4) -> tuple[Path, Path]:
+    """Write photos to ``images`` and their cameras to ``truth``; return both folders."""
     images, truth = folder / "images", folder / "truth"
     images.mkdir()
     truth.mkdir()
     pycolmap.set_random_seed(3)
     model = pycolmap.synthesize_dataset(
         pycolmap.SyntheticDatasetOptions(
-            num_rigs=1, num_frames_per_rig=4, num_points3D=300, camera_width=1024, camera_height=768,
+            num_rigs=1, num_frames_per_rig=num_photos, num_points3D=300, camera_width=1024, camera_height=768,
             camera_model_id=pycolmap.CameraModelId.SIMPLE_PINHOLE, camera_params=[1280, 512, 384],
         )
     )  # fmt: skip

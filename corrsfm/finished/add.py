@@ -1,0 +1,678 @@
+"""Photos added to a finished scene, whose model does not move.
+
+The stages do the work, over a list of photos that has grown: each keeps what it has and makes what is new.
+Pairs of photos that were there are not chosen again, the database is added to, and the new photos are put
+into the models as those are. Each stage's record is what `corrsfm run` would leave, so that a later run with
+the same options finds everything up to date.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pycolmap
+
+from corrsfm import config as cfg
+from corrsfm.colmap.cameras import camera_from_pycolmap, with_focal_length
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.models import read_models
+from corrsfm.colmap.pairs import read_verified_matches
+from corrsfm.database.stage import fingerprint_of as database_fingerprint
+from corrsfm.database.write import add_to_database
+from corrsfm.errors import InputError, WorkspaceError, first_few
+from corrsfm.features.stage import extract_features
+from corrsfm.files import atomic_path, atomic_write_json, sha256_of
+from corrsfm.finished.advice import next_step
+from corrsfm.finished.incoming import Incoming, PhotoPaths, find_photos, require_readable
+from corrsfm.images.cache import PhotoCache
+from corrsfm.images.cameras import assign_cameras
+from corrsfm.images.convert import is_converted
+from corrsfm.images.index import duplicate_images, name_remarks
+from corrsfm.images.listing import find_masks
+from corrsfm.images.stage import fingerprint_of as index_fingerprint
+from corrsfm.machine import count_threads, find_device
+from corrsfm.matches.stage import match_pairs
+from corrsfm.pairs.stage import fingerprint_of as pairs_fingerprint
+from corrsfm.pairs.strategies import pairs_of_new_photos
+from corrsfm.prune.stage import prune_matches
+from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
+from corrsfm.reconstruction.growth import grow
+from corrsfm.reconstruction.record import record_of
+from corrsfm.reconstruction.resection import Resection, camera_in_model, focal_of_photos
+from corrsfm.reconstruction.stage import fingerprint_of as models_fingerprint
+from corrsfm.report.stage import report
+from corrsfm.report.statistics import SceneReport
+from corrsfm.types import Camera, ImageRecord, Pair, PairList
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.commands import STAGE_COMMANDS
+from corrsfm.workspace.hloc import FEATURES, PRUNED, check_hloc_keys
+from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_index, write_pairs
+from corrsfm.workspace.resume import StageOutcome, finish, photos_left_out
+from corrsfm.workspace.store import ItemStore
+
+__all__ = ["AddResult", "AddedPhoto", "add_photos"]
+
+logger = logging.getLogger("corrsfm")
+
+_ORIGIN = "added"
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddedPhoto:
+    """What became of a photo.
+
+    Attributes
+    ----------
+    name : str
+    model : int or None
+        Number of the model that it joined; None if it joined none.
+    num_inliers : int
+        Points of the model that agree with its pose.
+    median_error_px : float or None
+        Their reprojection error before the pose was refined.
+    reason, next_step : str
+        Why it joined none, and what to try; empty if it did.
+    """
+
+    name: str
+    model: int | None
+    num_inliers: int
+    median_error_px: float | None
+    reason: str = ""
+    next_step: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AddResult:
+    """What an addition did.
+
+    Attributes
+    ----------
+    photos : tuple of AddedPhoto
+        The new photos, sorted by name.
+    already_there : tuple of str
+        Photos that the scene holds with the same bytes; nothing was done for them.
+    num_new_pairs : int
+        Pairs that were matched.
+    num_new_points : int
+    report : SceneReport or None
+        As written to `report.json`; None if there was nothing to do.
+    """
+
+    photos: tuple[AddedPhoto, ...]
+    already_there: tuple[str, ...]
+    num_new_pairs: int = 0
+    num_new_points: int = 0
+    report: SceneReport | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON, with the summary of the report."""
+        return {
+            "photos": [dataclasses.asdict(photo) for photo in self.photos],
+            "already_there": list(self.already_there),
+            "num_new_pairs": self.num_new_pairs,
+            "num_new_points": self.num_new_points,
+            "summary": self.report.to_dict()["summary"] if self.report else None,
+        }
+
+
+def add_photos(
+    workspace: Path | str,
+    photos: PhotoPaths = (),
+    *,
+    refine: bool = False,
+    run: cfg.RunConfig | None = None,
+) -> AddResult:
+    """Add photos to a finished scene: only what is new is computed, and the model does not move.
+
+    Photos from elsewhere are copied into the folder of the scene's photos, where the next run finds them.
+    After an interruption the same call goes on.
+
+    Parameters
+    ----------
+    workspace : path
+    photos : path or sequence of paths
+        Photos and folders of photos; may be left out to finish an addition that was interrupted.
+    refine : bool
+        At the end adjust the whole model: all poses, cameras and points may move a little.
+    run : RunConfig, optional
+        A seed of 0 stands for that of the scene's last run.
+
+    Returns
+    -------
+    AddResult
+
+    Raises
+    ------
+    InputError
+        If a photo cannot be read, or its name is that of another photo of the scene. Nothing was changed.
+    WorkspaceError
+        If the scene has no current model, or another process works there.
+    """
+    scene = Workspace(Path(workspace))
+    with scene.lock():
+        run = _with_seed(run or cfg.RunConfig(), scene)
+        pending = _pending_addition(scene)
+        find_device(run.device)
+        incoming, already = _sort_out(find_photos(photos, scene.images_dir), scene, pending.photos)
+        wanted = {**pending.photos, **{photo.name: photo.sha256 for photo in incoming}}
+        if not wanted:
+            if not already:
+                raise InputError(
+                    f"{scene.root}: no photos to add were named; try: corrsfm add {scene.root} NEW"
+                )
+            return AddResult(photos=(), already_there=already)
+        _require_photos(scene, incoming, wanted)
+        pending = dataclasses.replace(pending, photos=wanted)
+        atomic_write_json(scene.adding, dataclasses.asdict(pending))
+        _copy(incoming, scene.images_dir)
+        return _Addition(scene, pending, refine, run).finish(already)
+
+
+def _with_seed(run: cfg.RunConfig, workspace: Workspace) -> cfg.RunConfig:
+    """The seed of the scene's last run if none was asked for, so that its records keep fitting."""
+    try:
+        seed = json.loads(workspace.run_json.read_text(encoding="utf-8"))["seed"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return run
+    return dataclasses.replace(run, seed=run.seed or int(seed))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pending:
+    """What `adding.json` keeps of an addition until it has finished.
+
+    Attributes
+    ----------
+    photos : dict of str to str
+        New photo → hash of its bytes.
+    options : dict
+        Stage → its options. A stage that is interrupted while it writes has no record for a moment.
+    """
+
+    photos: dict[str, str]
+    options: dict[str, dict[str, Any]]
+
+
+def _pending_addition(workspace: Workspace) -> _Pending:
+    """The addition that was interrupted, or one without photos yet.
+
+    Raises
+    ------
+    WorkspaceError
+        If nothing was interrupted and the scene has no current model.
+    """
+    try:
+        pending = _Pending(**json.loads(workspace.adding.read_text(encoding="utf-8")))
+    except FileNotFoundError:
+        workspace.require("models")
+        return _Pending(
+            photos={}, options={stage: workspace.require(stage).config for stage in STAGE_COMMANDS}
+        )
+    except (OSError, ValueError, TypeError) as error:
+        raise WorkspaceError(
+            f"{workspace.adding}: damaged ({error}); delete it, and do everything again with corrsfm run"
+        ) from error
+    logger.info("going on with the addition of %s", first_few(pending.photos))
+    return pending
+
+
+def _sort_out(
+    found: Sequence[Incoming], workspace: Workspace, pending: Mapping[str, str]
+) -> tuple[list[Incoming], tuple[str, ...]]:
+    """The photos that are new, and the names of those that the scene holds already.
+
+    Raises
+    ------
+    InputError
+        Naming photos whose name another photo has.
+    """
+    known = {record.name: record.sha256 for record in read_index(workspace).records}
+    new, already, taken = [], [], []
+    for photo in found:
+        place = workspace.images_dir / photo.name
+        there = pending.get(photo.name) or known.get(photo.name)
+        if there is None and place.is_file():
+            there = sha256_of(place)
+        if there not in (None, photo.sha256):
+            taken.append(f"{photo.path}: the scene has another photo of the name {photo.name}")
+        elif photo.name in known and photo.name not in pending:
+            already.append(photo.name)
+        else:
+            new.append(photo)
+    if taken:
+        raise InputError("\n".join(taken) + "\nrename them and add them again; nothing was changed")
+    return new, tuple(already)
+
+
+def _require_photos(workspace: Workspace, incoming: Sequence[Incoming], wanted: Mapping[str, str]) -> None:
+    """Check that every photo that is needed can be read, before anything is changed.
+
+    Raises
+    ------
+    InputError
+        Naming those that cannot, and photos of the scene that are gone or were changed.
+    """
+    folder = workspace.images_dir
+    if not folder.is_dir():
+        raise InputError(
+            f"{folder}: the folder of the scene's photos is not there; mount it, or say where it is with: "
+            + workspace.command_for("images", images_dir="NEWDIR")
+        )
+    named = {photo.name for photo in incoming}
+    lost = [name for name in wanted if name not in named and not (folder / name).is_file()]
+    if lost:
+        raise InputError(
+            f"{folder}: photos of the interrupted addition are not there: {first_few(lost)}; name them again"
+        )
+    check_hloc_keys(sorted({*read_index(workspace).names, *wanted}))
+    if converted := [photo.name for photo in incoming if is_converted(photo.name)]:
+        raise InputError(
+            f"{first_few(converted)}: cannot be added as they are, other tools do not read them; make JPEGs of "
+            "them, or put them beside the scene's photos and run the scene again"
+        )
+    require_readable(incoming)
+
+
+def _copy(incoming: Sequence[Incoming], folder: Path) -> None:
+    """Copy the photos that lie elsewhere into the folder of the scene's photos."""
+    outside = [photo for photo in incoming if not (folder / photo.name).is_file()]
+    for photo in outside:
+        try:
+            with atomic_path(folder / photo.name) as temporary:
+                shutil.copy2(photo.path, temporary)
+        except OSError as error:
+            raise InputError(
+                f"{folder / photo.name}: cannot be written ({error.strerror}); put the new photos into the "
+                f"folder of the scene's photos yourself and run the same command on them there"
+            ) from error
+    if outside:
+        logger.info("copied to %s: %s", folder, first_few(photo.name for photo in outside))
+
+
+class _Addition:
+    """The stages of one addition, each of which does nothing if it is done."""
+
+    def __init__(self, workspace: Workspace, pending: _Pending, refine: bool, run: cfg.RunConfig) -> None:
+        self._workspace = workspace
+        self._new = sorted(pending.photos)
+        self._recorded = pending.options
+        self._refine = refine
+        self._run = run
+
+    def _options(self, stage: str, options: type[T]) -> T:
+        return cfg.from_dict(options, self._recorded[stage], f"{self._workspace.adding}: {stage}")
+
+    def finish(self, already: tuple[str, ...]) -> AddResult:
+        """Do what is left to do."""
+        workspace, run = self._workspace, self._run
+        self._say(self._index())
+        self._say(extract_features(workspace, self._options("features", cfg.FeaturesConfig), run))
+        self._say(self._pairs())
+        matched = match_pairs(workspace, self._options("matches", cfg.MatchesConfig), run)
+        self._say(matched)
+        self._say(prune_matches(workspace, self._options("pruned matches", cfg.PruneConfig), run))
+        self._say(self._database())
+        num_new_points = self._models()
+        summary = report(workspace, html=True)
+        workspace.adding.unlink(missing_ok=True)
+        return AddResult(
+            photos=self._outcomes(summary),
+            already_there=already,
+            num_new_pairs=matched.num_items - matched.num_reused,
+            num_new_points=num_new_points,
+            report=summary,
+        )
+
+    @staticmethod
+    def _say(outcome: StageOutcome) -> None:
+        logger.info("%s", outcome)
+
+    def _index(self) -> StageOutcome:
+        """List the new photos, with cameras of photos like them."""
+        workspace, started = self._workspace, time.monotonic()
+        index = read_index(workspace)
+        grown = index
+        fresh = sorted(set(self._new) - set(index.names))
+        config = self._options("images", cfg.ImagesConfig)
+        if fresh:
+            cache = PhotoCache(workspace.photo_cache)
+            grown = _grown_index(index, fresh, workspace.images_dir, config, cache)
+            cache.save()
+            if config.image_list is not None:
+                logger.warning(
+                    "the photos of this scene were chosen by --image-list %s: put the new names into it, or "
+                    "the next run leaves them out",
+                    config.image_list,
+                )
+            elif workspace.images_dir.resolve() not in [
+                Path(given).resolve() for given in workspace.given_photos
+            ]:
+                logger.warning(
+                    "this scene was made of %s: the next run takes what that holds, without the new photos",
+                    first_few(workspace.given_photos),
+                )
+            write_index(workspace, grown)
+        outcome = StageOutcome(
+            stage="images",
+            num_items=len(grown.records),
+            num_reused=len(grown.records) - len(fresh),
+            seconds=time.monotonic() - started,
+            skipped=not fresh,
+        )
+        # An interruption may have come between the list and its record.
+        if not workspace.is_current("images", index_fingerprint(grown), workspace.images_json):
+            finish(workspace, outcome, index_fingerprint(grown), config)
+        return outcome
+
+    def _pairs(self) -> StageOutcome:
+        """Add the pairs of the new photos to the list."""
+        workspace, started = self._workspace, time.monotonic()
+        index, features = read_index(workspace), workspace.require("features")
+        config = self._options("pairs", cfg.PairsConfig)
+        fingerprint = pairs_fingerprint(
+            index, features.fingerprint, config, self._run.seed, is_sequence=workspace.is_sequence
+        )
+        known = read_pairs(workspace)
+        if workspace.is_current("pairs", fingerprint, workspace.pairs, workspace.pair_origins):
+            return StageOutcome(stage="pairs", num_items=len(known), num_reused=len(known), skipped=True)
+        left_out = photos_left_out(workspace, index.names)
+        names = [name for name in index.names if name not in left_out]
+        with ItemStore(workspace.features, FEATURES).reader() as read_features:
+            proposed = pairs_of_new_photos(
+                names,
+                [name for name in self._new if name not in left_out],
+                config.num_retrieved,
+                load_features=read_features,
+                seed=self._run.seed,
+            )
+        origins: dict[Pair, tuple[str, ...]] = dict(zip(known.pairs, known.origins, strict=True))
+        # A user's list may hold a pair the other way round.
+        there = {frozenset(pair) for pair in known.pairs}
+        origins |= {pair: (_ORIGIN,) for pair in proposed if frozenset(pair) not in there}
+        pairs = tuple(sorted(origins))
+        write_pairs(workspace, PairList(pairs=pairs, origins=tuple(origins[pair] for pair in pairs)))
+        outcome = StageOutcome(
+            stage="pairs", num_items=len(pairs), num_reused=len(known), seconds=time.monotonic() - started
+        )
+        finish(workspace, outcome, fingerprint, config, inputs={"features": features.fingerprint})
+        return outcome
+
+    def _database(self) -> StageOutcome:
+        """Add the new photos to the database and verify their pairs."""
+        workspace, started = self._workspace, time.monotonic()
+        config = self._options("verified matches", cfg.DatabaseConfig)
+        fingerprint = database_fingerprint(workspace, config, self._run.seed)
+        pairs = read_pairs(workspace).pairs
+        if workspace.is_current("verified matches", fingerprint, workspace.database):
+            return StageOutcome(
+                stage="verified matches", num_items=len(pairs), num_reused=len(pairs), skipped=True
+            )
+        fresh = set(self._new)
+        index = read_index(workspace)
+        of_new = [pair for pair in pairs if not fresh.isdisjoint(pair)]
+        with (
+            ItemStore(workspace.features, FEATURES).reader() as read_features,
+            ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
+        ):
+            add_to_database(
+                workspace.database,
+                images=[record for record in index.records if record.name in fresh],
+                cameras=_cameras_of_new(workspace, index, self._new),
+                features=read_features,
+                kept=((*pair, read_pruned(pair).indices) for pair in of_new),
+                config=config,
+                seed=self._run.seed,
+                num_threads=count_threads(self._run.threads),
+                log_file=workspace.log,
+            )
+        outcome = StageOutcome(
+            stage="verified matches",
+            num_items=len(pairs),
+            num_reused=len(pairs) - len(of_new),
+            seconds=time.monotonic() - started,
+        )
+        inputs = {"pruned matches": workspace.require("pruned matches").fingerprint}
+        finish(workspace, outcome, fingerprint, config, inputs=inputs)
+        return outcome
+
+    def _models(self) -> int:
+        """Put the new photos into the models, the first one first; the number of new points."""
+        workspace, run, started = self._workspace, self._run, time.monotonic()
+        _restore_models(workspace)
+        verified = workspace.require("verified matches")
+        config = self._options("models", cfg.ReconstructionConfig)
+        fingerprint = models_fingerprint(verified.fingerprint, config, run.seed)
+        if workspace.is_current("models", fingerprint, workspace.sparse / "0", workspace.added):
+            return 0
+        models = read_models(workspace.sparse)
+        matches = read_verified_matches(workspace.database)
+        index = read_index(workspace)
+        known_focal = {
+            record.name: index.camera_of(record).has_prior_focal_length or not config.refine_intrinsics
+            for record in index.records
+        }
+        placed: dict[str, tuple[int, Resection]] = {}
+        last: dict[str, Resection] = {}
+        num_new_points = 0
+        for number, model in enumerate(models):
+            growth = grow(
+                model,
+                [name for name in self._new if name not in placed],
+                workspace.database,
+                matches,
+                known_focal=known_focal,
+                refine=self._refine,
+                refine_principal_point=config.refine_principal_point,
+                seed=run.seed,
+                num_threads=count_threads(run.threads),
+            )
+            placed |= {name: (number, found) for name, found in growth.registered.items()}
+            # What the first model says is what most want to know.
+            last = {**growth.failed, **last}
+            if growth.registered:
+                num_new_points += growth.num_new_points
+                models[number] = growth.model
+                _colour(growth.model, growth.registered, workspace.images_dir)
+        self._write(models, placed, last)
+        outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
+        finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
+        self._say(outcome)
+        return num_new_points
+
+    def _write(
+        self,
+        models: Sequence[pycolmap.Reconstruction],
+        placed: Mapping[str, tuple[int, Resection]],
+        last: Mapping[str, Resection],
+    ) -> None:
+        """Write the models, what became of each photo, and the verdict on the first model as it is now."""
+        workspace = self._workspace
+        held = {
+            image.name: number
+            for number, model in reversed(list(enumerate(models)))
+            for image in model.images.values()
+            if image.has_pose
+        }
+        before = read_added(workspace)
+        record = {}
+        for name in self._new:
+            found = placed[name][1] if name in placed else last.get(name)
+            # An interrupted addition may have placed it before.
+            numbers = before.get(name, {}) if found is None else _numbers(found)
+            record[name] = {**numbers, "model": held.get(name)}
+        atomic_write_json(workspace.added, {"photos": {**before, **record}})
+        with atomic_path(workspace.sparse) as temporary:
+            for number, model in enumerate(models):
+                (temporary / str(number)).mkdir(parents=True)
+                model.write_binary(temporary / str(number))
+        if workspace.evidence.exists():
+            with ItemStore(workspace.features, FEATURES).reader() as load:
+                evidence = SceneEvidence(
+                    read_index(workspace).names,
+                    read_verified_matches(workspace.database),
+                    load,
+                    seed=self._run.seed,
+                )
+                selection = judge_as_it_is(
+                    models[0], evidence, name=_ORIGIN, reason="photos were added to a finished model"
+                )
+                atomic_write_json(workspace.evidence, record_of(selection, evidence))
+            logger.info("verdict: %s", selection.verdict)
+
+    def _outcomes(self, summary: SceneReport) -> tuple[AddedPhoto, ...]:
+        """What became of each photo, with a reason and a next step where it joined no model."""
+        added = read_added(self._workspace)
+        missing = {photo.name: photo for photo in summary.missing}
+        outcomes = []
+        for name in self._new:
+            entry = added.get(name, {})
+            lost = entry.get("model") is None and name in missing
+            reason = ""
+            if lost:
+                photo = missing[name]
+                reason = entry.get("why_not") or f"{photo.reason}: {photo.detail}"
+            outcomes.append(
+                AddedPhoto(
+                    name=name,
+                    model=entry.get("model"),
+                    num_inliers=entry.get("num_inliers", 0),
+                    median_error_px=entry.get("median_error_px"),
+                    reason=reason,
+                    next_step=next_step(missing[name], self._workspace) if lost else "",
+                )
+            )
+        return tuple(outcomes)
+
+
+def _grown_index(
+    index: Index, fresh: Sequence[str], folder: Path, config: cfg.ImagesConfig, cache: PhotoCache
+) -> Index:
+    """The index with more photos; a new photo gets the camera of the photos that it is grouped with.
+
+    Raises
+    ------
+    InputError
+        If photos of the scene are gone or were changed, or a new one does not fit the camera options.
+    """
+    before = {record.name: record for record in index.records}
+    gone = [name for name in before if not (folder / name).is_file()]
+    changed = [
+        name for name in before if name not in gone and cache.hash_of(folder / name) != before[name].sha256
+    ]
+    for names, what in ((gone, "are not there any more"), (changed, "were changed since")):
+        if names:
+            raise InputError(
+                f"{folder}: photos of the scene {what}: {first_few(names)}; put them back, or do everything "
+                "again with corrsfm run"
+            )
+    names = sorted([*before, *fresh])
+    infos = [cache.info_of(folder / name) for name in names]
+    proposed, groups = assign_cameras(
+        names, infos, mode=config.camera_mode, model=config.camera_model, params=config.camera_params
+    )
+    cameras = list(index.cameras)
+    camera_of_group = {
+        group: before[name].camera_id for name, group in zip(names, groups, strict=True) if name in before
+    }
+    for group, camera in enumerate(proposed):
+        if group not in camera_of_group:
+            camera_of_group[group] = len(cameras)
+            cameras.append(camera)
+    masks = find_masks(config.mask_dir, folder, names)
+    records = []
+    for name, group, info, mask in zip(names, groups, infos, masks, strict=True):
+        records.append(
+            before[name]
+            if name in before
+            else ImageRecord(
+                name=name,
+                camera_id=camera_of_group[group],
+                sha256=cache.hash_of(folder / name),
+                mask=mask,
+                mask_sha256=sha256_of(config.mask_dir / mask) if config.mask_dir and mask else None,
+                gps=info.gps,
+            )
+        )
+    for remark in name_remarks(fresh):
+        logger.warning("%s", remark)
+    for group_of_equals in duplicate_images(records):
+        if not set(fresh).isdisjoint(group_of_equals):
+            logger.warning("photos with the same content: %s", ", ".join(group_of_equals))
+    # In the order of the first photo of each, as listing the folder would number them.
+    order = list(dict.fromkeys(record.camera_id for record in records))
+    position = {old: number for number, old in enumerate(order)}
+    return Index(
+        records=tuple(
+            dataclasses.replace(record, camera_id=position[record.camera_id]) for record in records
+        ),
+        cameras=tuple(cameras[old] for old in order),
+    )
+
+
+def _cameras_of_new(workspace: Workspace, index: Index, new: Sequence[str]) -> dict[str, tuple[int, Camera]]:
+    """For each new photo the id of its camera in the database, and the camera to write under a new id.
+
+    A photo shares the camera of the photos that it is grouped with if all of them have one and the same in
+    the model. Otherwise it gets its own, for which their focal lengths are the guess if there is no other.
+    """
+    models = read_models(workspace.sparse)
+    with colmap_log(), pycolmap.Database.open(workspace.database) as database:
+        used = {camera.camera_id for camera in database.read_all_cameras()}
+    free = max({*used, *(i for model in models for i in model.cameras)}, default=0) + 1
+    records = {record.name: record for record in index.records}
+    own: dict[int, int] = {}
+    chosen = {}
+    for name in new:
+        group = records[name].camera_id
+        companions = [one.name for one in index.records if one.camera_id == group and one.name not in new]
+        shared = camera_in_model(models[0], companions)
+        if shared is not None:
+            chosen[name] = (shared, camera_from_pycolmap(models[0].cameras[shared]))
+            continue
+        camera, focal_px = index.cameras[group], focal_of_photos(models[0], companions)
+        if focal_px is not None and not camera.has_prior_focal_length:
+            camera = dataclasses.replace(with_focal_length(camera, focal_px), has_prior_focal_length=False)
+        # Photos of which none is known yet share what they are grouped by; others proved to differ.
+        number = own.get(group) if not companions else None
+        if number is None:
+            number, free = free, free + 1
+            own[group] = number
+        chosen[name] = (number, camera)
+    return chosen
+
+
+def _restore_models(workspace: Workspace) -> None:
+    """Put the models back if an interruption came while their folder was replaced."""
+    aside = workspace.sparse.with_name(f".{workspace.sparse.name}.old")
+    if not workspace.sparse.exists() and aside.is_dir():
+        os.replace(aside, workspace.sparse)
+
+
+def _colour(model: pycolmap.Reconstruction, names: Mapping[str, Resection], folder: Path) -> None:
+    """Colour the points that have no colour yet by the new photos."""
+    with colmap_log():
+        for name in names:
+            model.extract_colors_for_image(model.find_image_with_name(name).image_id, folder)
+
+
+def _numbers(found: Resection) -> dict[str, Any]:
+    """What is kept of a search for a pose."""
+    return {
+        "num_inliers": found.num_inliers,
+        "num_candidates": found.num_candidates,
+        "median_error_px": found.median_error_px if np.isfinite(found.median_error_px) else None,
+        "why_not": found.why_not,
+    }

@@ -1,0 +1,47 @@
+"""What to try next, as commands that can be pasted."""
+
+from __future__ import annotations
+
+import shlex
+
+from corrsfm.report.missing import MissingPhoto, MissingReason
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.commands import STAGE_COMMANDS
+
+__all__ = ["command_again", "next_step"]
+
+
+def command_again(workspace: Workspace, stage: str, *flags: str) -> str:
+    """The commands that make a stage with further options, and all stages that hang on it.
+
+    Every other option stays what it was.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    stage : str
+    flags : str
+        Words to add to the first command.
+    """
+    stages = list(STAGE_COMMANDS)
+    commands = list(dict.fromkeys(workspace.command_for(one) for one in stages[stages.index(stage) :]))
+    return "; ".join([" ".join([commands[0], *map(shlex.quote, flags)]), *commands[1:]])
+
+
+def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
+    """What to try for a photo that is not in the first model."""
+    match missing.reason:
+        case MissingReason.LEFT_OUT:
+            return f"replace the file, then: {workspace.command_for('features')}"
+        case MissingReason.NO_PAIR:
+            return command_again(workspace, "pairs", "--pairing", "exhaustive")
+        case MissingReason.NO_MATCH:
+            return "look at the photo: it may be blank, blurred or masked; leave it out or replace it"
+        case MissingReason.PRUNED:
+            return command_again(workspace, "pruned matches", "--method", "ratio")
+        case MissingReason.NOT_VERIFIED:
+            return command_again(workspace, "pruned matches", "--min-num-inliers", "10")
+        case MissingReason.NOT_MAPPED:
+            return workspace.command_for("models")
+    root = shlex.quote(str(workspace.root))
+    return f"take photos between this one and those of the model, then: corrsfm add {root} NEWPHOTOS"

@@ -1,0 +1,98 @@
+"""Photos that come to a finished scene: found, read and checked before anything is changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from corrsfm.errors import ImageError, InputError
+from corrsfm.files import sha256_of
+from corrsfm.images.listing import list_images
+from corrsfm.images.photos import read_image
+
+__all__ = ["Incoming", "PhotoPaths", "find_photos", "name_in", "require_readable"]
+
+PhotoPaths = Path | str | Sequence[Path | str]
+"""Photos, and folders of photos."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Incoming:
+    """A photo that comes.
+
+    Attributes
+    ----------
+    name : str
+        What it is called in the scene.
+    path : Path
+        Where it lies now.
+    sha256 : str
+        Of its bytes.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+
+
+def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
+    """The photos that paths name, sorted by name.
+
+    A photo in the folder of the scene's photos keeps its name there. Any other is called by its path in the
+    folder that was given, or by its file name.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+    images_dir : Path or None
+        Folder of the scene's photos; None if they do not join: then they are called by their paths.
+
+    Raises
+    ------
+    InputError
+        If a path does not exist, a folder holds no photo, or two different photos would have one name.
+    """
+    given = [Path(paths)] if isinstance(paths, Path | str) else [Path(path) for path in paths]
+    found: dict[str, Incoming] = {}
+    for path in given:
+        if path.is_dir():
+            files = [(name, path / name) for name in list_images(path, at_least=1)]
+        elif path.is_file():
+            files = [(path.name, path)]
+        else:
+            raise InputError(f"{path}: no such photo or folder")
+        for name, file in files:
+            called = str(file) if images_dir is None else name_in(file, images_dir) or name
+            photo = Incoming(name=called, path=file, sha256=sha256_of(file))
+            other = found.setdefault(photo.name, photo)
+            if other.sha256 != photo.sha256:
+                raise InputError(
+                    f"{file}: would be called {photo.name}, as {other.path} would, which is another photo; "
+                    "rename one of them"
+                )
+    return [found[name] for name in sorted(found)]
+
+
+def name_in(file: Path, folder: Path) -> str:
+    """Posix path of a file relative to a folder; empty if it lies elsewhere."""
+    place, root = file.resolve(), folder.resolve()
+    return place.relative_to(root).as_posix() if place.is_relative_to(root) else ""
+
+
+def require_readable(photos: Sequence[Incoming]) -> None:
+    """Read every photo once.
+
+    Raises
+    ------
+    ImageError
+        Naming all that cannot be read.
+    """
+    problems = []
+    for photo in photos:
+        try:
+            read_image(photo.path)
+        except ImageError as error:
+            problems.append(str(error))
+    if problems:
+        raise ImageError("\n".join(problems) + "\nreplace or leave out these photos; nothing was changed")

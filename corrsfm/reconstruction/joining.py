@@ -1,0 +1,480 @@
+"""Several models of one scene: joined where enough points say how, and the joined model holds.
+
+What may be the same point in both is taken from photos that both hold, from matches between their photos
+that pruning kept though the pair was not verified, and from the look of the points themselves. All of them
+together decide on one similarity, so that pairs which are too weak alone count. A joined model is kept only
+if it explains and predicts what its parts did.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
+from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.sqlite import database_errors
+from corrsfm.reconstruction.best_model import SceneEvidence
+from corrsfm.reconstruction.calibration import has_possible_cameras, refine
+from corrsfm.reconstruction.folds.unfold import judge_model
+from corrsfm.reconstruction.predicted import nearest_descriptors
+from corrsfm.reconstruction.resection import Landmarks
+from corrsfm.reconstruction.similarity import Observed, Similarity, find_similarity
+from corrsfm.reconstruction.views import views_of
+from corrsfm.types import Features, Pair
+
+__all__ = ["Joining", "join_models"]
+
+FEWEST_POINTS = 15
+"""Points that must agree with one similarity. By chance up to 8 do."""
+_MAX_ERROR_SHARE, _LEAST_ERROR_PX = 0.01, 4.0
+_MAX_POINTS = 20_000
+_MAX_ATTEMPTS = 12
+# Adjusting the whole moves a few matches over a threshold.
+_LEAST_EXPLAINED, _LEAST_PREDICTED = 0.99, 0.97
+_LEAST_ACROSS = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Joining:
+    """An attempt to join two models.
+
+    Attributes
+    ----------
+    photos0, photos1 : tuple of str
+        Of the two models, sorted.
+    is_joined : bool
+    num_candidates : int
+        Pairs of points that may be the same.
+    num_points : int
+        Those that agree with one similarity.
+    reason : str
+        Why they were joined, or why not and what is missing, a clause.
+    """
+
+    photos0: tuple[str, ...]
+    photos1: tuple[str, ...]
+    is_joined: bool
+    num_candidates: int
+    num_points: int
+    reason: str
+
+    def __str__(self) -> str:
+        models = f"models of {len(self.photos0)} and {len(self.photos1)} photos"
+        return f"{models} {'joined' if self.is_joined else 'not joined'}: {self.reason}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "photos0": list(self.photos0),
+            "photos1": list(self.photos1),
+            "is_joined": self.is_joined,
+            "num_candidates": self.num_candidates,
+            "num_points": self.num_points,
+            "reason": self.reason,
+        }
+
+
+def join_models(
+    models: Sequence[pycolmap.Reconstruction],
+    database: Path,
+    evidence: SceneEvidence,
+    *,
+    seed: int = 0,
+    refine_intrinsics: bool = True,
+    refine_principal_point: bool = False,
+    num_threads: int = 1,
+) -> tuple[list[pycolmap.Reconstruction], list[Joining]]:
+    """Join what can be joined of several models.
+
+    The work is bounded by the number of points and attempts, not by a clock, so that equal arguments give
+    equal models; with more than one thread up to rounding.
+
+    Parameters
+    ----------
+    models : sequence of pycolmap.Reconstruction
+        The largest first; not changed.
+    database : Path
+        That they were mapped from; not changed.
+    evidence : SceneEvidence
+    seed : int
+    refine_intrinsics, refine_principal_point : bool
+        What may change of the cameras when a joined model is adjusted.
+    num_threads : int
+
+    Returns
+    -------
+    models : list of pycolmap.Reconstruction
+        Those that are left; a joined model stands in the place of its larger part.
+    attempts : list of Joining
+        In the order of trying.
+
+    Raises
+    ------
+    DatabaseError
+        If the database cannot be read.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
+    options.refine_principal_point = refine_principal_point
+    options.ceres.solver_options.num_threads = num_threads
+    left = list(models)
+    attempts: list[Joining] = []
+    tried: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
+    while len(attempts) < _MAX_ATTEMPTS:
+        names = [Landmarks(model).photos for model in left]
+        pair = next(
+            (
+                (i, j)
+                for i in range(len(left))
+                for j in range(i + 1, len(left))
+                if (names[i], names[j]) not in tried
+            ),
+            None,
+        )
+        if pair is None:
+            break
+        i, j = pair
+        tried.add((names[i], names[j]))
+        joined, attempt = _join(left[i], left[j], database, evidence, options, seed)
+        attempts.append(attempt)
+        if joined is not None:
+            left[i] = joined
+            del left[j]
+    return left, attempts
+
+
+def _join(
+    a: pycolmap.Reconstruction,
+    b: pycolmap.Reconstruction,
+    database: Path,
+    evidence: SceneEvidence,
+    options: pycolmap.BundleAdjustmentOptions,
+    seed: int,
+) -> tuple[pycolmap.Reconstruction | None, Joining]:
+    candidates = _candidates(a, b, database, evidence.features)
+    side_a, side_b = (_observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
+    longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
+    max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
+    found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
+    agreeing = np.zeros(len(side_a), np.bool_) if found is None else found[1]
+    same = candidates.same_points(agreeing)
+
+    def outcome(reason: str, joined: bool = False) -> Joining:
+        return Joining(
+            photos0=Landmarks(a).photos,
+            photos1=Landmarks(b).photos,
+            is_joined=joined,
+            num_candidates=len(candidates.same_points(np.ones(len(side_a), np.bool_))),
+            num_points=len(same),
+            reason=reason,
+        )
+
+    if found is None or len(same) < FEWEST_POINTS:
+        return None, outcome(
+            f"{len(same)} points agree on how they lie to one another, {FEWEST_POINTS} are needed: photos "
+            "that show what both show would join them"
+        )
+    joined = _merged(a, b, found[0], same, database, seed)
+    refine(joined, options)
+    if _merge_predicted(joined, _across(a, b, evidence.predicted(views_of(joined)))):
+        refine(joined, options)
+    objection = _objection(a, b, joined, evidence)
+    if objection:
+        return None, outcome(f"{len(same)} points agree on how they lie to one another, but {objection}")
+    return joined, outcome(f"{len(same)} points agree on how they lie to one another", joined=True)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Candidates:
+    """Observations that may be of the same point: (image id, keypoint, point id) a row, of either model."""
+
+    a: NDArray[np.int64]
+    b: NDArray[np.int64]
+
+    def same_points(self, chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
+        """Distinct pairs of point ids among chosen rows, each point once, those with most rows first."""
+        pairs, counts = np.unique(
+            np.column_stack([self.a[chosen, 2], self.b[chosen, 2]]), axis=0, return_counts=True
+        )
+        taken_a: set[int] = set()
+        taken_b: set[int] = set()
+        same = []
+        for row in np.argsort(-counts, kind="stable"):
+            point_a, point_b = (int(value) for value in pairs[row])
+            if point_a not in taken_a and point_b not in taken_b:
+                taken_a.add(point_a)
+                taken_b.add(point_b)
+                same.append((point_a, point_b))
+        return same
+
+
+def _candidates(
+    a: pycolmap.Reconstruction,
+    b: pycolmap.Reconstruction,
+    database: Path,
+    load: Callable[[str], Features],
+) -> _Candidates:
+    rows = [
+        *_by_common_photos(a, b),
+        *_by_kept_matches(a, b, database),
+        *_by_looks(a, b, load),
+    ]
+    unique = np.unique(np.array(rows, np.int64).reshape(-1, 6), axis=0)
+    return _Candidates(a=unique[:, :3], b=unique[:, 3:])
+
+
+def _registered(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
+    return {image.name: image for image in model.images.values() if image.has_pose}
+
+
+def _by_common_photos(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> list[tuple[int, ...]]:
+    """Keypoints of photos in both models that see a point in both."""
+    landmarks_a, landmarks_b = Landmarks(a), Landmarks(b)
+    images_a, images_b = _registered(a), _registered(b)
+    rows: list[tuple[int, ...]] = []
+    for name in sorted(images_a.keys() & images_b.keys()):
+        points_a, points_b = landmarks_a.of_keypoints(name), landmarks_b.of_keypoints(name)
+        for k in np.flatnonzero((points_a >= 0) & (points_b >= 0)):
+            image_a, image_b = images_a[name].image_id, images_b[name].image_id
+            rows.append((image_a, int(k), int(points_a[k]), image_b, int(k), int(points_b[k])))
+    return rows
+
+
+def _by_kept_matches(
+    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, database: Path
+) -> list[tuple[int, ...]]:
+    """Kept matches between a photo of either model, whether or not the pair was verified."""
+    ids_a = {image.image_id: name for name, image in _registered(a).items()}
+    ids_b = {image.image_id: name for name, image in _registered(b).items()}
+    landmarks_a, landmarks_b = Landmarks(a), Landmarks(b)
+    rows: list[tuple[int, ...]] = []
+    with colmap_log(), database_errors(database), pycolmap.Database.open(database) as tables:
+        for pair_id in sorted(tables.read_num_matches()[0]):
+            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
+            for first, second, columns in ((id0, id1, (0, 1)), (id1, id0, (1, 0))):
+                if first not in ids_a or second not in ids_b or first in ids_b or second in ids_a:
+                    continue
+                matches = np.asarray(tables.read_matches(id0, id1), np.int64)[:, columns]
+                points_a = landmarks_a.of_keypoints(ids_a[first])[matches[:, 0]]
+                points_b = landmarks_b.of_keypoints(ids_b[second])[matches[:, 1]]
+                for row in np.flatnonzero((points_a >= 0) & (points_b >= 0)):
+                    rows.append(
+                        (
+                            first,
+                            int(matches[row, 0]),
+                            int(points_a[row]),
+                            second,
+                            int(matches[row, 1]),
+                            int(points_b[row]),
+                        )
+                    )
+    return rows
+
+
+def _by_looks(
+    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, load: Callable[[str], Features]
+) -> list[tuple[int, ...]]:
+    """Points of either model whose descriptors are nearest to each other and clearly nearer than the next."""
+    rows_a, descriptors_a = _described(a, load)
+    rows_b, descriptors_b = _described(b, load)
+    forward, backward = _nearest(descriptors_a, descriptors_b), _nearest(descriptors_b, descriptors_a)
+    return [(*rows_a[i], *rows_b[j]) for i, j in sorted(forward.items()) if backward.get(j) == i]
+
+
+def _nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> dict[int, int]:
+    """Row of a → its nearest row of b, where it passes the ratio test against the second."""
+    if len(a) == 0 or len(b) < 2:
+        return {}
+    found = nearest_descriptors(a, b, num=2)
+    return {int(row): int(index) for row, index in zip(found.keypoints, found.indices[:, 0], strict=True)}
+
+
+def _described(
+    model: pycolmap.Reconstruction, load: Callable[[str], Features]
+) -> tuple[list[tuple[int, int, int]], NDArray[np.uint8]]:
+    """An observation (image id, keypoint, point id) of each point, long tracks first, and its look."""
+    ranked = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
+    rows = []
+    for point_id, point in ranked[:_MAX_POINTS]:
+        first = min(point.track.elements, key=lambda element: (element.image_id, element.point2D_idx))
+        rows.append((int(first.image_id), int(first.point2D_idx), int(point_id)))
+    by_image: dict[int, list[int]] = defaultdict(list)
+    for number, row in enumerate(rows):
+        by_image[row[0]].append(number)
+    descriptors = np.zeros((0, 128), np.uint8)
+    for image_id, numbers in sorted(by_image.items()):
+        own = load(model.images[image_id].name).descriptors
+        if len(descriptors) == 0:
+            descriptors = np.zeros((len(rows), own.shape[1]), np.uint8)
+        descriptors[numbers] = own[[rows[number][1] for number in numbers]]
+    return rows, descriptors
+
+
+def _observed(model: pycolmap.Reconstruction, rows: NDArray[np.int64]) -> Observed:
+    num = len(rows)
+    rotations, translations = np.zeros((num, 3, 3)), np.zeros((num, 3))
+    rays, focal_px = np.zeros((num, 2)), np.zeros(num)
+    for image_id in np.unique(rows[:, 0]):
+        image = model.images[int(image_id)]
+        here = rows[:, 0] == image_id
+        pose = image.cam_from_world()
+        rotations[here], translations[here] = pose.rotation.matrix(), pose.translation
+        pixels = np.array([image.points2D[int(k)].xy for k in rows[here, 1]])
+        camera = model.cameras[image.camera_id]
+        rays[here] = normalise_points(camera_from_pycolmap(camera), pixels)
+        focal_px[here] = camera.mean_focal_length()
+    points = np.array([model.points3D[int(i)].xyz for i in rows[:, 2]]).reshape(-1, 3)
+    return Observed(
+        points=points, rotations=rotations, translations=translations, rays=rays, focal_px=focal_px
+    )
+
+
+def _merged(
+    a: pycolmap.Reconstruction,
+    b: pycolmap.Reconstruction,
+    a_from_b: Similarity,
+    same: Sequence[tuple[int, int]],
+    database: Path,
+    seed: int,
+) -> pycolmap.Reconstruction:
+    """Model a with the photos and points that only b has, brought into the frame of a."""
+    merged = pycolmap.Reconstruction(a)
+    in_a, in_b = _registered(a), _registered(b)
+    moved = pycolmap.Reconstruction(b)
+    moved.transform(
+        pycolmap.Sim3d(a_from_b.scale, pycolmap.Rotation3d(a_from_b.rotation), a_from_b.translation)
+    )
+    used = {image.camera_id for image in in_a.values()}
+    with colmap_log(), database_errors(database):
+        with pycolmap.Database.open(database) as tables:
+            cache = pycolmap.DatabaseCache.create(tables, pycolmap.DatabaseCacheOptions())
+        mapper = pycolmap.IncrementalMapper(cache)
+        mapper.begin_reconstruction(merged)
+        new = sorted(in_b.keys() - in_a.keys())
+        for name in new:
+            image, source = merged.find_image_with_name(name), moved.find_image_with_name(name)
+            if image.camera_id not in used:
+                merged.cameras[image.camera_id].params = list(moved.cameras[source.camera_id].params)
+            merged.frames[image.frame_id].set_cam_from_world(image.camera_id, source.cam_from_world())
+            merged.register_frame(image.frame_id)
+        _add_points(mapper, merged, moved, set(new), {point_b: point_a for point_a, point_b in same})
+        options = pycolmap.IncrementalTriangulatorOptions()
+        options.random_seed = seed
+        mapper.complete_and_merge_tracks(options)
+        mapper.end_reconstruction(False)
+    return merged
+
+
+def _add_points(
+    mapper: pycolmap.IncrementalMapper,
+    merged: pycolmap.Reconstruction,
+    moved: pycolmap.Reconstruction,
+    new: set[str],
+    point_in_a: dict[int, int],
+) -> None:
+    """Give the merged model the observations of its new photos."""
+    observations = mapper.observation_manager
+    for point_id, point in sorted(moved.points3D.items()):
+        elements = [
+            pycolmap.TrackElement(
+                merged.find_image_with_name(moved.images[element.image_id].name).image_id,
+                element.point2D_idx,
+            )
+            for element in point.track.elements
+            if moved.images[element.image_id].name in new
+        ]
+        target = point_in_a.get(int(point_id))
+        if target is not None and target in merged.points3D:
+            for element in elements:
+                observations.add_observation(target, element)
+        elif len(elements) > 1:
+            track = pycolmap.Track()
+            for element in elements:
+                track.add_element(element)
+            observations.add_point3D(point.xyz, track, point.color)
+
+
+def _across(
+    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, matches: Mapping[Pair, NDArray[np.int32]]
+) -> dict[Pair, NDArray[np.int32]]:
+    """Those matches that are of pairs which neither model holds."""
+    in_a, in_b = _registered(a).keys(), _registered(b).keys()
+    return {pair: m for pair, m in matches.items() if not (in_a >= set(pair) or in_b >= set(pair))}
+
+
+def _merge_predicted(joined: pycolmap.Reconstruction, across: Mapping[Pair, NDArray[np.int32]]) -> int:
+    """Make one of two points that a predicted match says are the same, where their photos agree; how many.
+
+    The first points that joined the parts may be few; these hold them together more firmly.
+    """
+    num_merged = 0
+    for (name0, name1), matches in sorted(across.items()):
+        image0, image1 = joined.find_image_with_name(name0), joined.find_image_with_name(name1)
+        for keypoint0, keypoint1 in matches:
+            seen0, seen1 = image0.points2D[int(keypoint0)], image1.points2D[int(keypoint1)]
+            if not (seen0.has_point3D() and seen1.has_point3D()) or seen0.point3D_id == seen1.point3D_id:
+                continue
+            point0, point1 = joined.points3D[seen0.point3D_id], joined.points3D[seen1.point3D_id]
+            common = {e.image_id for e in point0.track.elements} & {e.image_id for e in point1.track.elements}
+            if common or not (_sees(image0, point1, seen0.xy) and _sees(image1, point0, seen1.xy)):
+                continue
+            joined.merge_points3D(seen0.point3D_id, seen1.point3D_id)
+            num_merged += 1
+    return num_merged
+
+
+def _sees(image: pycolmap.Image, point: pycolmap.Point3D, pixel: NDArray[np.float64]) -> bool:
+    """Whether a photo would see a point near a pixel."""
+    projected = image.project_point(point.xyz)
+    return projected is not None and bool(np.linalg.norm(projected - pixel) <= _LEAST_ERROR_PX)
+
+
+def _objection(
+    a: pycolmap.Reconstruction,
+    b: pycolmap.Reconstruction,
+    joined: pycolmap.Reconstruction,
+    evidence: SceneEvidence,
+) -> str:
+    """What speaks against a joined model, a clause; empty if nothing does."""
+    views_a, views_b, views = views_of(a), views_of(b), views_of(joined)
+    if views.keys() < views_a.keys() | views_b.keys() or not has_possible_cameras(joined):
+        return "the joined model lost photos"
+    explained = {(p.name0, p.name1): p for p in evidence.explain(views).pairs}
+    parts: dict[Pair, int] = defaultdict(int)
+    for own in (views_a, views_b):
+        for pair in evidence.explain(own).pairs:
+            key = (pair.name0, pair.name1)
+            parts[key] = max(parts[key], pair.num_explained)
+    before, after = sum(parts.values()), sum(explained[key].num_explained for key in parts)
+    if after < _LEAST_EXPLAINED * before:
+        return f"the joined model explains {after} matches, its parts {before}"
+    across = [
+        pair
+        for key, pair in explained.items()
+        if not (views_a.keys() >= set(key) or views_b.keys() >= set(key)) and pair.is_registered
+    ]
+    num_across = sum(pair.num_verified for pair in across)
+    if num_across and sum(pair.num_explained for pair in across) < _LEAST_ACROSS * num_across:
+        return "most verified matches between them contradict it"
+    predicted = evidence.predicted(views)
+    separate: dict[Pair, int] = defaultdict(int)
+    for own in (views_a, views_b):
+        for key, matches in evidence.predicted(own).items():
+            separate[key] = max(separate[key], len(matches))
+    before, after = sum(separate.values()), sum(len(predicted[key]) for key in separate)
+    if after < _LEAST_PREDICTED * before:
+        return f"the joined model predicts {after} matches where its parts predict {before}"
+    was_folded = any(judge_model(model, evidence.verified).evidence.folded for model in (a, b))
+    # That no pair across is verified is why they are parts; what counts is what the joined model finds.
+    shared = {**_across(a, b, predicted), **evidence.verified}
+    if not was_folded and judge_model(joined, shared).evidence.folded:
+        return "the joined model would be folded: photos side by side do not share what both should see"
+    return ""
