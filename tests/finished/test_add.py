@@ -57,8 +57,8 @@ def test_only_the_new_photos_and_their_pairs_are_computed(
     extracted = []
     create = corrsfm.features.stage.create_extractor
 
-    def counting(config: cfg.FeaturesConfig):  # type: ignore[no-untyped-def]
-        extract = create(config)
+    def counting(config: cfg.FeaturesConfig, device: str):  # type: ignore[no-untyped-def]
+        extract = create(config, device)
 
         def count(*arguments):  # type: ignore[no-untyped-def]
             extracted.append(1)
