@@ -36,9 +36,7 @@ def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[Verified
         recorded = dict(database.execute("SELECT pair_id, rows FROM matches"))
         num_inliers = dict(database.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0"))
     looked_up = _ids_of_pairs(names, pairs)
-    num_matches = {
-        pair_id: rows for pair_id, rows in recorded.items() if rows > 0 or pair_id in looked_up
-    }
+    num_matches = {pair_id: rows for pair_id, rows in recorded.items() if rows > 0 or pair_id in looked_up}
     return sorted(
         (
             VerifiedPair(

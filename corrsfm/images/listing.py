@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import mimetypes
 import os
 from collections import Counter
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import read_lines
 
-__all__ = ["IMAGE_SUFFIXES", "find_masks", "list_images"]
+__all__ = ["IMAGE_SUFFIXES", "find_masks", "holds_pictures", "list_images"]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp")
 # Photos that neither OpenCV nor pycolmap reads: phones' and cameras' own formats.
@@ -77,6 +78,15 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
             f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
         )
     return sorted(names)
+
+
+def holds_pictures(folder: Path) -> bool:
+    """Whether a folder or its sub-folders hold any photo or video, readable here or not."""
+    suffixes = (*IMAGE_SUFFIXES, *_FOREIGN_SUFFIXES)
+    return any(
+        name.lower().endswith(suffixes) or (mimetypes.guess_type(name)[0] or "").startswith("video/")
+        for name in _visible_files(folder)
+    )
 
 
 def _visible_files(folder: Path) -> list[str]:
