@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -84,11 +85,19 @@ class SceneReport:
     @property
     def verdict(self) -> str:
         """The verdict in one line; empty if there is none."""
-        if "verdict" not in self.evidence:
+        if "verdict" in self.evidence:
+            verdict = self.evidence["verdict"]
+            step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
+            return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
+        if self.models or not self.missing:
             return ""
-        verdict = self.evidence["verdict"]
-        step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
-        return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
+        return f"no model: {self.why_no_model}; {self.missing[0].next_step}"
+
+    @property
+    def why_no_model(self) -> str:
+        """What most photos lack, where there is no model."""
+        reason, num = Counter(photo.reason for photo in self.missing).most_common(1)[0]
+        return f"{num:,} of {len(self.image_names):,} photos: {reason}"
 
     @property
     def num_registered(self) -> int:
@@ -154,7 +163,7 @@ class SceneReport:
                 "num_verified_matches": verified,
                 "num_components": len(self.components),
                 "seconds": sum(self.stage_seconds.values()),
-                "verdict": self.evidence["verdict"]["grade"] if self.verdict else None,
+                "verdict": self.evidence.get("verdict", {}).get("grade"),
                 "explained_share": self.evidence.get("explained_share"),
                 "num_predicted_matches": self.evidence.get("num_predicted_matches"),
             },
