@@ -154,6 +154,25 @@ def test_a_changed_prune_option_redoes_pruning_only(workspace: Workspace, photos
     assert outcome["pruned matches"] == (6, 0)
 
 
+def test_a_method_that_was_used_before_prunes_nothing_again(workspace: Workspace, photos: Path) -> None:
+    methods = [cfg.PruneConfig(method=cfg.PruneMethod(name)) for name in ("ratio", "none", "ratio")]
+    kept = [run_front(workspace, photos, prune=method)["pruned matches"] for method in methods]
+    assert kept == [(6, 0), (6, 0), (6, 6)]
+    verify(workspace, photos)
+    after = contents(workspace)
+    fresh = Workspace(workspace.root.with_name("fresh"), create=True)
+    run_front(fresh, photos)
+    assert after == contents(fresh)
+
+
+def test_kept_matches_of_a_workspace_from_before_are_found(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    shutil.rmtree(workspace.pruned_by("ratio").parent)
+    none = cfg.PruneConfig(method=cfg.PruneMethod.NONE)
+    assert run_front(workspace, photos)["pruned matches"] == (6, 6)
+    assert run_front(workspace, photos, prune=none)["pruned matches"] == (6, 0)
+
+
 def test_an_option_of_speed_redoes_nothing(workspace: Workspace, photos: Path) -> None:
     run_front(workspace, photos)
     pipeline.match_pairs(workspace, cfg.MatchesConfig(block_size=17), RUN)

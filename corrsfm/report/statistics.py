@@ -55,7 +55,8 @@ class SceneReport:
     missing : tuple of MissingPhoto
         Photos that are not registered, sorted by name.
     stage_seconds : dict
-        Stage → seconds of wall clock it took when it was last run, in the order of the stages.
+        Stage → seconds of wall clock that what is there took to make, over all runs, in the order of the
+        stages.
     configuration : dict
         The options of the run.
     versions : dict

@@ -3,7 +3,8 @@
 ::
 
     WORKSPACE/
-    ├── workspace.json      format version, image folder, and per stage: fingerprint, options, seconds
+    ├── workspace.json      format version, image folder, per stage fingerprint, options and seconds, and what
+    │                       the items of a file took to make
     ├── images.txt          names of the photos, one per line
     ├── images.json         photos and cameras as corrsfm knows them
     ├── features.h5         keypoints and descriptors
@@ -11,6 +12,7 @@
     ├── pair_origins.tsv    the strategies that proposed each pair
     ├── matches.h5          putative matches
     ├── pruned.h5           matches that passed pruning
+    ├── .pruned/METHOD.h5   those of each method that was tried; pruned.h5 is the last one, by another name
     ├── cameras.json        which photos share a camera, and by what evidence
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
@@ -66,7 +68,7 @@ class StageRecord:
     inputs : dict
         Stage → fingerprint of what it read.
     seconds : float
-        Wall-clock seconds of the run that finished it.
+        Wall-clock seconds that what is there took to make, over all runs that had a part in it.
     num_items, num_reused : int
         Items of the stage, and how many of them an earlier run had done.
     """
@@ -205,6 +207,10 @@ class Workspace:
             self._values = self._load()
             yield
 
+    def pruned_by(self, method: str) -> Path:
+        """Where the kept matches of a prune method lie, whichever is the current one."""
+        return self.root / ".pruned" / f"{method}.h5"
+
     @property
     def images_dir(self) -> Path:
         """Folder of the photos.
@@ -283,8 +289,16 @@ class Workspace:
             {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
         )
 
-    def finish(self, stage: str, record: StageRecord) -> None:
-        """Record a stage as finished now."""
+    def cost_of(self, path: Path) -> tuple[float, int]:
+        """Seconds that the items of a file took to make, and how many they are; zeros if it is not known."""
+        cost = self._values.get("costs", {}).get(path.relative_to(self.root).as_posix(), {})
+        return float(cost.get("seconds", 0.0)), int(cost.get("num_items", 0))
+
+    def finish(self, stage: str, record: StageRecord, made: Path | None = None) -> None:
+        """Record a stage as finished now, and its seconds as what the items of a file took."""
+        if made is not None:
+            cost = {"seconds": record.seconds, "num_items": record.num_items}
+            self._values.setdefault("costs", {})[made.relative_to(self.root).as_posix()] = cost
         if stage == "models":
             self._values.pop("mapping_failed", None)
         stamped = {**record.__dict__, "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
