@@ -6,9 +6,11 @@ Each stage is a function of a workspace and its options that skips what is finis
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,7 @@ from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome
+from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, keep_warnings
 
 __all__ = [
     "StageOutcome",
@@ -49,7 +52,12 @@ logger = logging.getLogger("corrsfm")
 
 
 def run_scene(
-    images_dir: Path, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
+    images_dir: Path,
+    workspace_dir: Path,
+    config: cfg.PipelineConfig,
+    *,
+    overwrite: bool = False,
+    warned: Sequence[str] = (),
 ) -> SceneReport:
     """Go from a folder of photos to models and a report, skipping what is finished.
 
@@ -59,6 +67,8 @@ def run_scene(
     config : PipelineConfig
     overwrite : bool
         Redo finished work.
+    warned : sequence of str
+        What the caller warned of already, such as options without effect; for the report.
 
     Returns
     -------
@@ -71,9 +81,12 @@ def run_scene(
         What the stages raise. If mapping fails, the report is written all the same, because it tells why.
     """
     run = config.run
-    check_options(run, config.prune)
-    workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
-    with workspace.lock():
+    with contextlib.ExitStack() as stack:
+        with collect_warnings() as met:
+            check_options(run, config.prune)
+            workspace = Workspace(workspace_dir, create=True, images_dir=images_dir)
+            stack.enter_context(workspace.lock())
+        keep_warnings(workspace.warnings_json, BEFORE_STAGES, [*warned, *met])
         _say(index_photos(workspace, images_dir, config.images, run, overwrite=overwrite))
         _say(extract_features(workspace, config.features, run, overwrite=overwrite))
         _say(make_pairs(workspace, config.pairs, run, overwrite=overwrite))

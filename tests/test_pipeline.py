@@ -1,6 +1,8 @@
 """Resume that can be trusted: what is redone, what is kept, and that a kill loses nothing."""
 
+import contextlib
 import dataclasses
+import json
 import os
 import random
 import shutil
@@ -152,6 +154,15 @@ def test_a_changed_prune_option_redoes_pruning_only(workspace: Workspace, photos
     assert outcome["features"] == (4, 4)
     assert outcome["matches"] == (6, 6)
     assert outcome["pruned matches"] == (6, 0)
+
+
+def test_what_was_warned_of_before_the_first_stage_is_in_the_report(tmp_path: Path, photos: Path) -> None:
+    config = cfg.PipelineConfig(features=SMALL, prune=cfg.PruneConfig(method=cfg.PruneMethod.RATIO), run=RUN)
+    for warned in (["--precision: no effect"], []):
+        with contextlib.suppress(ReconstructionError):
+            run_scene(photos, tmp_path / "scene", config, warned=warned)
+        values = json.loads((tmp_path / "scene" / "report.json").read_text())
+        assert [one["message"] for one in values["warnings"] if one["stage"] == "run"] == warned
 
 
 def test_a_method_that_was_used_before_prunes_nothing_again(workspace: Workspace, photos: Path) -> None:

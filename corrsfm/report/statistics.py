@@ -26,7 +26,8 @@ class StageWarning:
     Attributes
     ----------
     stage : str
-        As in `SceneReport.stage_seconds`, or "report" for what making the report met.
+        As in `SceneReport.stage_seconds`, "run" before the first of them, or "report" for what making the
+        report met.
     message : str
         May have several lines.
     """
