@@ -116,7 +116,9 @@ def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str,
         if not folder.name.startswith(".") and folder.resolve() != other
     }
     if not scenes:
-        raise InputError(f"{collection}: no sub-folders; expected one for each scene")
+        raise InputError(
+            f"{collection}: no sub-folders; expected one for each scene; for photos of one scene: corrsfm run"
+        )
     return scenes
 
 

@@ -74,6 +74,8 @@ def list_images(folder: Path, *, image_list: Path | None = None, mask_dir: Path 
         )
     if len(names) < 2:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
+        if not names and "workspace.json" in files:
+            found = "is a workspace; the folder of photos comes first: corrsfm run PHOTOS WORKSPACE"
         raise InputError(
             f"{where}: {found}; at least two overlapping photos are needed ({', '.join(IMAGE_SUFFIXES)})"
         )

@@ -36,6 +36,7 @@ import fcntl
 import json
 import logging
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Iterator
@@ -43,7 +44,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_write_json
 from corrsfm.workspace.commands import command_for, label_of
 
@@ -127,6 +128,9 @@ class Workspace:
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"
         self.log = root / "log.txt"
+        # What was there before this workspace was begun, and which folders were made for it; None if it was
+        # begun earlier.
+        self._begun: tuple[set[str], list[Path]] | None = None
         if not self.manifest.exists():
             self._start(create)
         self._values = self._load()
@@ -146,6 +150,9 @@ class Workspace:
                 f"{self.root}: holds {' and '.join(foreign)} of another tool; choose an empty folder, "
                 "nothing was touched"
             )
+        if not own:
+            before = set(os.listdir(self.root)) if self.root.exists() else set()
+            self._begun = before, [path for path in (self.root, *self.root.parents) if not path.exists()]
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -174,7 +181,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the workspace for this process.
+        """Hold the workspace for this process; one that was begun with unusable input vanishes again.
 
         Raises
         ------
@@ -205,7 +212,22 @@ class Workspace:
                     error.strerror,
                 )
             self._values = self._load()
-            yield
+            try:
+                yield
+            except InputError:
+                if self._begun is not None and not self._values["stages"]:
+                    self._vanish(*self._begun)
+                raise
+
+    def _vanish(self, before: set[str], made: list[Path]) -> None:
+        """Remove what making the workspace left, so that a mistyped command leaves nothing."""
+        for path in (self.manifest, self.photo_cache, self.warnings_json, self.log, self.root / ".lock"):
+            if path.name not in before:
+                path.unlink(missing_ok=True)
+        # Fails where something of use is there.
+        with contextlib.suppress(OSError):
+            for folder in made:
+                folder.rmdir()
 
     def pruned_by(self, method: str) -> Path:
         """Where the kept matches of a prune method lie, whichever is the current one."""
@@ -254,6 +276,9 @@ class Workspace:
             Naming the command to run.
         """
         record = self.record_of(stage)
+        if record is None and stage == "models" and self.mapping_failed:
+            why = shlex.join(["corrsfm", "report", str(self.root)])
+            raise WorkspaceError(f"{self.root}: mapping gave no model; why: {why}")
         if record is None:
             raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self.command_for(stage)}")
         for name, fingerprint in record.inputs.items():
