@@ -2,6 +2,7 @@
 # make test   the default tests (minutes)
 # make test-slow   the sample scenes end to end (more minutes)
 # make test-processors   the numeric tests as older processors round, see tests/processors.sh
+# make test-consumers   the packages that read our exports, on our exports (downloads 600 MB)
 # make lint   format check, linter, type checker; make format repairs what it can
 # make reference   write docs/reference.md from the commands' help
 # make tables   write the tables of README.md and results/README.md from the result files
@@ -12,7 +13,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
-.PHONY: demo test test-slow test-processors lint format reference tables clean
+.PHONY: demo test test-slow test-processors test-consumers lint format reference tables clean
 
 $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
@@ -34,6 +35,9 @@ test-slow: $(STAMP)
 
 test-processors: $(STAMP)
 	sh tests/processors.sh $(BIN)/python
+
+test-consumers: $(STAMP)
+	sh tests/consumers.sh $(BIN)/python $(VENV)/consumers
 
 lint: $(STAMP)
 	$(BIN)/ruff format --check .

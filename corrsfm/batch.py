@@ -11,13 +11,14 @@ import contextlib
 import functools
 import itertools
 import json
+import logging
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,10 +26,13 @@ from typing import Any
 from tqdm import tqdm
 
 from corrsfm.config import load_pipeline
-from corrsfm.errors import DependencyError, InputError
+from corrsfm.errors import DependencyError, InputError, WorkspaceError
+from corrsfm.images.listing import holds_pictures
 from corrsfm.machine import count_threads
 
 __all__ = ["SceneStatus", "find_scenes", "run_collection"]
+
+logger = logging.getLogger("corrsfm")
 
 LOG_NAME = "batch.log"
 GRACE_SECONDS = 10.0
@@ -46,15 +50,38 @@ class SceneStatus:
     seconds : float
     message : str
         The error, if there was one.
+    empty : bool
+        There was nothing to do: the folder holds no photo. It did not succeed then, and did not fail either.
+    verdict : str
+        The grade of the first model; empty if there is no verdict.
     statistics : dict
-        The numbers of the summary in the scene's `report.json`; empty if it has none.
+        The numbers of the summary in the `report.json` of a scene that succeeded; else empty.
     """
 
     scene: str
     succeeded: bool
     seconds: float
     message: str = ""
+    empty: bool = False
+    verdict: str = ""
     statistics: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> bool:
+        """Whether there were photos and no model came out."""
+        return not self.succeeded and not self.empty
+
+    def __str__(self) -> str:
+        """One line for a person, but for the further lines of a message."""
+        result = "ok    " if self.succeeded else "empty " if self.empty else "FAILED"
+        outcome = self.message
+        if self.succeeded and "num_images" in self.statistics:
+            num, num_all = (f"{self.statistics[key]:g}" for key in ("num_registered", "num_images"))
+            outcome = ", ".join(filter(None, [f"{num} of {num_all} photos", self.verdict]))
+        # A name on disk need not be text.
+        scene = self.scene.encode("utf-8", "replace").decode().replace("\n", "?")
+        text = f"{scene:<24} {result} {self.seconds:8.1f} s  {outcome}"
+        return text.rstrip().replace("\n", "\n    ")
 
 
 def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str, Path]:
@@ -79,20 +106,34 @@ def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str,
     if not collection.is_dir():
         raise InputError(f"{collection}: not a folder; expected one with a sub-folder for each scene")
     other = leave_out.resolve() if leave_out is not None else None
+    try:
+        folders = sorted(path for path in collection.iterdir() if path.is_dir())
+    except OSError as error:
+        raise InputError(f"{collection}: cannot be read ({error.strerror}); check its permissions") from error
     scenes = {
-        folder.name: folder / "images" if (folder / "images").is_dir() else folder
-        for folder in sorted(collection.iterdir())
-        if folder.is_dir() and not folder.name.startswith(".") and folder.resolve() != other
+        folder.name: _photos_of(folder)
+        for folder in folders
+        if not folder.name.startswith(".") and folder.resolve() != other
     }
     if not scenes:
-        raise InputError(f"{collection}: no sub-folders; expected one for each scene")
+        raise InputError(
+            f"{collection}: no sub-folders; expected one for each scene; for photos of one scene: corrsfm run"
+        )
     return scenes
+
+
+def _photos_of(scene: Path) -> Path:
+    try:
+        return scene / "images" if (scene / "images").is_dir() else scene
+    except OSError:
+        # The scene's own run says that it may not be read.
+        return scene
 
 
 def run_collection(
     collection: Path, output: Path, arguments: Sequence[str] = (), *, jobs: int = 1, dask: str | None = None
 ) -> list[SceneStatus]:
-    """Run every scene of a collection.
+    """Run every scene of a collection; whatever happens to one is in its status, and the others go on.
 
     Parameters
     ----------
@@ -115,11 +156,18 @@ def run_collection(
 
     Raises
     ------
+    InputError
+        If the collection holds no scene.
+    WorkspaceError
+        If the output cannot be written.
     KeyboardInterrupt
         On Ctrl-C or SIGTERM, after ending the scenes under way; the same call resumes them.
     """
     scenes = find_scenes(collection, leave_out=output)
-    output.mkdir(parents=True, exist_ok=True)
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise WorkspaceError(f"{output}: cannot be made ({error.strerror}); choose another folder") from error
     statuses: list[SceneStatus] = []
     processes = _Processes()
     # Dask could not send the processes of this machine to a worker.
@@ -127,25 +175,37 @@ def run_collection(
     if dask is None:
         work = functools.partial(run_one, call=processes.call)
     threads = _threads_argument(arguments, min(jobs, len(scenes))) if dask is None else []
-    waiting = []
+    waiting: dict[Future[SceneStatus], str] = {}
     with _terminable(), _executor(jobs, dask) as executor:
         try:
             for scene, images in scenes.items():
                 places = str(images.resolve()), str((output / scene).resolve())
-                waiting.append(executor.submit(work, scene, *places, [*threads, *arguments]))
+                waiting[executor.submit(work, scene, *places, [*threads, *arguments])] = scene
             with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
                 pending = set(waiting)
+                logger.info("scenes to do: %d", len(pending))
                 while pending:
                     # An unbounded wait can miss an interruption that comes just before it.
                     done, pending = wait(pending, POLL_SECONDS, FIRST_COMPLETED)
-                    statuses.extend(future.result() for future in done)
-                    bar.update(len(done))
+                    for future in done:
+                        statuses.append(_status_of(waiting[future], future))
+                        bar.update()
+                        logger.info("[%d/%d] %s", len(statuses), len(waiting), statuses[-1])
         except BaseException:
             for future in waiting:
                 future.cancel()
             processes.end()
             raise
     return sorted(statuses, key=lambda status: status.scene)
+
+
+def _status_of(scene: str, future: Future[SceneStatus]) -> SceneStatus:
+    """How a scene ended, also where the process or the machine that ran it did."""
+    try:
+        return future.result()
+    except Exception as error:
+        message = f"Error: {type(error).__name__}: {error}; run the same command again"
+        return SceneStatus(scene=scene, succeeded=False, seconds=0.0, message=message)
 
 
 def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
@@ -232,17 +292,30 @@ def run_one(
 ) -> SceneStatus:
     """Run one scene in its own process; its output goes to a log beside its workspace."""
     started = time.monotonic()
+    if not _lists_photos(arguments) and not holds_pictures(Path(images)):
+        return SceneStatus(scene=scene, succeeded=False, empty=True, seconds=0.0, message="no photos")
     log = Path(f"{workspace}.{LOG_NAME}")
     command = [sys.executable, "-m", "corrsfm", "--quiet", "run", images, workspace, *arguments]
-    with open(log, "w", encoding="utf-8") as handle:
-        code = call(command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+    try:
+        with open(log, "w", encoding="utf-8") as handle:
+            code = call(command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
+        message = "" if code == 0 else _last_error(log) or f"ended with code {code}"
+    except OSError as error:
+        code, message = 1, f"Error: {log}: cannot be written ({error.strerror}); the scene was not run"
+    summary = _summary(Path(workspace) / "report.json") if code == 0 else {}
     return SceneStatus(
         scene=scene,
         succeeded=code == 0,
         seconds=round(time.monotonic() - started, 1),
-        message="" if code == 0 else _last_error(log) or f"ended with code {code}",
-        statistics=_statistics(Path(workspace) / "report.json"),
+        message=message,
+        verdict=str(summary.get("verdict") or ""),
+        statistics={key: value for key, value in summary.items() if isinstance(value, int | float)},
     )
+
+
+def _lists_photos(arguments: Sequence[str]) -> bool:
+    """Whether a list, and no suffix, says which files are photos."""
+    return any(argument.split("=")[0] in ("--image-list", "--pipeline") for argument in arguments)
 
 
 def _last_error(log: Path) -> str:
@@ -252,9 +325,9 @@ def _last_error(log: Path) -> str:
     return "\n".join(lines[starts[-1] if starts else -1 :])
 
 
-def _statistics(report: Path) -> dict[str, float]:
+def _summary(report: Path) -> dict[str, Any]:
+    """The summary of a report; empty if there is none."""
     try:
-        values = json.loads(report.read_text(encoding="utf-8"))["summary"]
+        return dict(json.loads(report.read_text(encoding="utf-8"))["summary"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}
-    return {key: value for key, value in values.items() if isinstance(value, int | float)}

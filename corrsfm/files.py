@@ -21,6 +21,7 @@ __all__ = [
     "atomic_write_text",
     "read_lines",
     "sha256_of",
+    "share_file",
 ]
 
 OWN_RECORD = ".corrsfm.json"
@@ -86,6 +87,27 @@ def atomic_write_text(path: Path, text: str) -> None:
 def atomic_write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
     atomic_write_text(path, json.dumps(value, indent=2, ensure_ascii=False, default=str) + "\n")
+
+
+def share_file(source: Path, name: Path) -> None:
+    """Give a file another name without copying it, in place of what has that name.
+
+    Files are replaced, never changed, so neither name can harm the other.
+
+    Parameters
+    ----------
+    source : Path
+    name : Path
+        On a file system without hard links it becomes a copy.
+    """
+    # Renaming one name of a file to another of its names does nothing.
+    if name.exists() and os.path.samefile(source, name):
+        return
+    with atomic_path(name) as temporary:
+        try:
+            os.link(source, temporary)
+        except OSError:
+            shutil.copy2(source, temporary)
 
 
 def sha256_of(path: Path) -> str:

@@ -6,9 +6,11 @@ Each stage is a function of a workspace and its options that skips what is finis
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import platform
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.imported import refuse_foreign_files, traits_of, traits_to_come
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome
+from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, keep_warnings
 
 __all__ = [
     "StageOutcome",
@@ -53,7 +56,12 @@ logger = logging.getLogger("corrsfm")
 
 
 def run_scene(
-    photos: Given, workspace_dir: Path, config: cfg.PipelineConfig, *, overwrite: bool = False
+    photos: Given,
+    workspace_dir: Path,
+    config: cfg.PipelineConfig,
+    *,
+    overwrite: bool = False,
+    warned: Sequence[str] = (),
 ) -> SceneReport:
     """Go from photos or a video to models and a report, skipping what is finished.
 
@@ -65,6 +73,8 @@ def run_scene(
     config : PipelineConfig
     overwrite : bool
         Redo finished work.
+    warned : sequence of str
+        What the caller warned of already, such as options without effect; for the report.
 
     Returns
     -------
@@ -77,11 +87,15 @@ def run_scene(
         What the stages raise. If mapping fails, the report is written all the same, because it tells why.
     """
     run = config.run
-    check_options(
-        run, config.prune, features=config.features, matches=config.matches, workspace_dir=workspace_dir
-    )
-    workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
-    with workspace.lock():
+    with contextlib.ExitStack() as stack:
+        with collect_warnings() as met:
+            check_options(
+                run, config.prune, features=config.features, matches=config.matches,
+                workspace_dir=workspace_dir,
+            )  # fmt: skip
+            workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
+            stack.enter_context(workspace.lock())
+        keep_warnings(workspace.warnings_json, BEFORE_STAGES, [*warned, *met])
         _say(index_photos(workspace, photos, config.images, run, overwrite=overwrite))
         _say(extract_features(workspace, config.features, run, overwrite=overwrite))
         _say(make_pairs(workspace, config.pairs, run, overwrite=overwrite))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,16 +11,20 @@ import time
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from photos import write_photos
 
 from corrsfm import batch
 from corrsfm.batch import find_scenes, run_collection, run_one
+from corrsfm.cli import main
+from corrsfm.errors import WorkspaceError
 from corrsfm.report import make_report
 
 
 def collection(root: Path, *scenes: str) -> Path:
     for scene in scenes:
         (root / "collection" / scene).mkdir(parents=True)
+        (root / "collection" / scene / "0.jpg").touch()
     return root / "collection"
 
 
@@ -115,6 +120,63 @@ def test_without_an_error_the_message_is_what_there_is(
     stand_in(tmp_path, monkeypatch, script)
     (status,) = run_collection(collection(tmp_path, "a"), tmp_path / "out")
     assert status.message == message
+
+
+def test_a_folder_without_photos_is_empty_and_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch, 'echo "$6" >> "$0.called"')
+    root = collection(tmp_path, "notes", "phone", "photos")
+    (root / "notes" / "0.jpg").rename(root / "notes" / "0.txt")
+    (root / "phone" / "0.jpg").rename(root / "phone" / "0.HEIC")
+    statuses = run_collection(root, tmp_path / "out")
+    assert [(status.empty, status.succeeded, status.failed) for status in statuses] == [
+        (True, False, False),
+        (False, True, False),
+        (False, True, False),
+    ]
+    assert str(statuses[0]).split() == ["notes", "empty", "0.0", "s", "no", "photos"]
+    called = (tmp_path / "stand-in.called").read_text().split()
+    assert called == [str(tmp_path / "out" / scene) for scene in ("phone", "photos")]
+    result = CliRunner().invoke(main, ["batch", str(root), str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    shutil.rmtree(root / "phone")
+    shutil.rmtree(root / "photos")
+    result = CliRunner().invoke(main, ["batch", str(root), str(tmp_path / "out")])
+    assert result.exit_code == 1
+    assert "no photos in any of 1 folders" in result.output
+
+
+def test_every_scene_that_ends_is_a_line_of_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    stand_in(tmp_path, monkeypatch, 'test "${6%b}" = "$6"')
+    caplog.set_level("INFO", "corrsfm")
+    run_collection(collection(tmp_path, *"ab"), tmp_path / "out")
+    assert [" ".join(message.split()[:3]) for message in caplog.messages] == [
+        "scenes to do:", "[1/2] a ok", "[2/2] b FAILED",
+    ]  # fmt: skip
+
+
+def test_what_befalls_a_scene_is_its_row_and_the_others_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    # No log can be written where a folder has its name.
+    (tmp_path / "out" / "b.batch.log").mkdir(parents=True)
+    monkeypatch.setattr(batch, "holds_pictures", lambda folder: 1 // len(folder.name.strip("c")))
+    statuses = run_collection(collection(tmp_path, *"abcd"), tmp_path / "out")
+    assert [status.succeeded for status in statuses] == [True, False, False, True]
+    assert statuses[1].message.endswith(
+        "b.batch.log: cannot be written (Is a directory); the scene was not run"
+    )
+    assert statuses[2].message.startswith("Error: ZeroDivisionError: ")
+
+
+def test_an_output_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "out").touch()
+    with pytest.raises(WorkspaceError, match=r"out: cannot be made \(.*\); choose another folder"):
+        run_collection(collection(tmp_path, "a"), tmp_path / "out")
 
 
 def test_an_unreadable_photo_is_named(tmp_path: Path) -> None:

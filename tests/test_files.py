@@ -1,11 +1,12 @@
 """Files come into being whole, and are told apart by what they hold."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from corrsfm.errors import InputError
-from corrsfm.files import atomic_path, atomic_write_text, read_lines, sha256_of
+from corrsfm.files import atomic_path, atomic_write_text, read_lines, sha256_of, share_file
 
 
 def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
@@ -54,3 +55,22 @@ def test_a_list_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     (tmp_path / "latin.txt").write_bytes(b"caf\xe9.jpg")
     with pytest.raises(InputError, match=r"latin\.txt: is not UTF-8 text .*; save it as UTF-8"):
         read_lines(tmp_path / "latin.txt")
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_shared_file_takes_the_place_of_another_and_survives_its_replacement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_links: bool
+) -> None:
+    def no_links(*paths: object) -> None:
+        raise OSError("no hard links here")
+
+    if not has_links:
+        monkeypatch.setattr(os, "link", no_links)
+    first, name = tmp_path / "first", tmp_path / "name"
+    first.write_text("1")
+    name.write_text("old")
+    share_file(first, name)
+    share_file(first, name)
+    atomic_write_text(first, "2")
+    assert (name.read_text(), first.read_text()) == ("1", "2")
+    assert sorted(tmp_path.iterdir()) == [first, name]

@@ -1,6 +1,8 @@
 """Resume that can be trusted: what is redone, what is kept, and that a kill loses nothing."""
 
+import contextlib
 import dataclasses
+import json
 import os
 import random
 import shutil
@@ -152,6 +154,34 @@ def test_a_changed_prune_option_redoes_pruning_only(workspace: Workspace, photos
     assert outcome["features"] == (4, 4)
     assert outcome["matches"] == (6, 6)
     assert outcome["pruned matches"] == (6, 0)
+
+
+def test_what_was_warned_of_before_the_first_stage_is_in_the_report(tmp_path: Path, photos: Path) -> None:
+    config = cfg.PipelineConfig(features=SMALL, prune=cfg.PruneConfig(method=cfg.PruneMethod.RATIO), run=RUN)
+    for warned in (["--precision: no effect"], []):
+        with contextlib.suppress(ReconstructionError):
+            run_scene(photos, tmp_path / "scene", config, warned=warned)
+        values = json.loads((tmp_path / "scene" / "report.json").read_text())
+        assert [one["message"] for one in values["warnings"] if one["stage"] == "run"] == warned
+
+
+def test_a_method_that_was_used_before_prunes_nothing_again(workspace: Workspace, photos: Path) -> None:
+    methods = [cfg.PruneConfig(method=cfg.PruneMethod(name)) for name in ("ratio", "none", "ratio")]
+    kept = [run_front(workspace, photos, prune=method)["pruned matches"] for method in methods]
+    assert kept == [(6, 0), (6, 0), (6, 6)]
+    verify(workspace, photos)
+    after = contents(workspace)
+    fresh = Workspace(workspace.root.with_name("fresh"), create=True)
+    run_front(fresh, photos)
+    assert after == contents(fresh)
+
+
+def test_kept_matches_of_a_workspace_from_before_are_found(workspace: Workspace, photos: Path) -> None:
+    run_front(workspace, photos)
+    shutil.rmtree(workspace.pruned_by("ratio").parent)
+    none = cfg.PruneConfig(method=cfg.PruneMethod.NONE)
+    assert run_front(workspace, photos)["pruned matches"] == (6, 6)
+    assert run_front(workspace, photos, prune=none)["pruned matches"] == (6, 0)
 
 
 def test_an_option_of_speed_redoes_nothing(workspace: Workspace, photos: Path) -> None:

@@ -77,8 +77,9 @@ def _how_to_go_on(ctx: click.Context) -> str:
 def main(quiet: bool) -> None:
     """Structure from motion with learned correspondence pruning.
 
-    `corrsfm run PHOTOS WORKSPACE` does everything; the other commands are its steps. Finished work is kept:
-    after an interruption or a changed option, run the same command again.
+    `corrsfm run PHOTOS WORKSPACE` goes from a folder of photos to models and a report, in steps that are
+    commands too; `corrsfm export WORKSPACE OUT --for TOOL` hands the result on. Finished work is kept: after
+    an interruption or a changed option, run the same command again.
     """
     logger = logging.getLogger("corrsfm")
     logger.handlers = [_Handler()]

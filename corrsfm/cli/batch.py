@@ -30,7 +30,8 @@ def batch(
     """Run every scene of a COLLECTION into OUTPUT/<scene>.
 
     A scene is a sub-folder with photos, or with a folder `images` of photos. All further arguments go to
-    `corrsfm run`. One scene's failure does not stop the others; run it again to go on.
+    `corrsfm run`. One scene's failure does not stop the others; run it again to go on. A folder without
+    photos is passed over.
     """
     from corrsfm.batch import run_collection
 
@@ -40,11 +41,11 @@ def batch(
         echo_json([status.__dict__ for status in statuses])
     else:
         for status in statuses:
-            result = "ok    " if status.succeeded else "FAILED"
-            message = status.message.replace("\n", "\n    ")
-            click.echo(f"{status.scene:<24} {result} {status.seconds:8.1f} s  {message}")
-    failed = sum(not status.succeeded for status in statuses)
+            click.echo(str(status))
+    failed = sum(status.failed for status in statuses)
     if failed:
         raise click.ClickException(
             f"{failed} of {len(statuses)} scenes failed; see {output}/<scene>.batch.log"
         )
+    if all(status.empty for status in statuses):
+        raise click.ClickException(f"{collection}: no photos in any of {len(statuses)} folders")

@@ -44,7 +44,21 @@ class _ExportCommand(click.Command):
         return super().parse_args(ctx, spelled)
 
 
-@click.command(cls=_ExportCommand, epilog="ply and csv write one file, the others a folder.")
+# The mark keeps click from filling the lines.
+_TARGETS = """\b
+splat       Gaussian splatting: gaussian-splatting, gsplat
+nerfstudio  nerfstudio: transforms.json
+colmap      COLMAP 4
+colmap3     COLMAP 3.8
+hloc        hloc: features, matches, model
+openmvs     OpenMVS: InterfaceCOLMAP
+bundler     CMVS, MeshLab
+nvm         VisualSFM, MeshLab
+ply         viewers: one file of points
+csv         spreadsheets: one file, a line a photo"""
+
+
+@click.command(cls=_ExportCommand, epilog=_TARGETS)
 @click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
 @click.argument("output", metavar="OUT", type=PATH)
 @click.option(
@@ -52,7 +66,7 @@ class _ExportCommand(click.Command):
     "target",
     type=click.Choice([str(target) for target in ExportTarget]),
     required=True,
-    help="What comes next.",
+    help="The tool that comes next, see below.",
 )
 @click.option("--upright", is_flag=True, help="Turn the world so that the cameras' common up is +z.")
 @click.option(

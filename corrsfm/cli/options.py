@@ -22,6 +22,7 @@ from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
 
 __all__ = [
     "OVERWRITE_KEY",
+    "WARNED_KEY",
     "config_options",
     "echo_json",
     "json_option",
@@ -35,6 +36,8 @@ __all__ = [
 
 # Set in the context of an invocation with --overwrite.
 OVERWRITE_KEY = "corrsfm.overwrite"
+# In the context, what was said of options before the command began.
+WARNED_KEY = "corrsfm.warned"
 
 logger = logging.getLogger("corrsfm")
 
@@ -202,7 +205,9 @@ def _warn_of_idle(config: Any, given: Collection[str]) -> None:
         if not set(chosen) & set(choices):
             idle.setdefault(f"--{chooser} {'+'.join(chosen)}", []).append(flag_of(entry.name))
     for choice, flags in idle.items():
-        logger.warning("%s: no effect with %s", ", ".join(flags), choice)
+        warning = f"{', '.join(flags)}: no effect with {choice}"
+        logger.warning("%s", warning)
+        click.get_current_context().meta.setdefault(WARNED_KEY, []).append(warning)
 
 
 def run_options(command: F) -> F:

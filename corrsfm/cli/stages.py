@@ -11,6 +11,7 @@ import click
 
 from corrsfm import config as cfg
 from corrsfm.cli.options import (
+    WARNED_KEY,
     config_options,
     echo_json,
     json_option,
@@ -20,6 +21,7 @@ from corrsfm.cli.options import (
 )
 from corrsfm.cli.sections import SectionedCommand
 from corrsfm.errors import ReconstructionError
+from corrsfm.export import ExportTarget
 
 if TYPE_CHECKING:
     from corrsfm.report import SceneReport
@@ -209,12 +211,14 @@ def run(
     """Do everything, from photos to a report.
 
     PHOTOS is a folder, a video, or any of several folders, photos, lists of photos (.txt) and quoted
-    patterns. Finished work is kept: after an interruption or a changed option, run the same command again.
+    patterns. They stay as they are; everything made goes into the folder WORKSPACE. Finished work is kept:
+    after an interruption or a changed option, run the same command again.
     """
     from corrsfm.pipeline import run_scene
 
-    result = run_scene(photos, workspace_dir, config, overwrite=overwrite)
-    _show_report(result, as_json, workspace_dir / "report.html")
+    warned = click.get_current_context().meta.get(WARNED_KEY, [])
+    result = run_scene(photos, workspace_dir, config, overwrite=overwrite, warned=warned)
+    _show_report(result, as_json, workspace_dir)
 
 
 def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> None:
@@ -225,15 +229,20 @@ def _print_report(workspace_dir: Path, as_json: bool, *, html: bool = False) -> 
     workspace = Workspace(workspace_dir)
     with workspace.lock():
         result = summarise(workspace, html=html)
-    _show_report(result, as_json, workspace.report_html if html else None)
+    _show_report(result, as_json, workspace_dir if html else None)
 
 
-def _show_report(report: SceneReport, as_json: bool, page: Path | None) -> None:
+def _show_report(report: SceneReport, as_json: bool, workspace_dir: Path | None) -> None:
+    """Show the statistics and, of a workspace whose page was written, where to go on."""
     from corrsfm.report import format_table
 
     if as_json:
         echo_json(report.to_dict())
         return
     click.echo(format_table(report))
-    if page is not None:
-        click.echo(f"\nreport: {page}")
+    if workspace_dir is None:
+        return
+    click.echo(f"\nreport: {workspace_dir / 'report.html'}")
+    if report.models:
+        export = shlex.join(["corrsfm", "export", str(workspace_dir), "OUT", "--for", "nerfstudio"])
+        click.echo(f"next:   {export}, or another of: {', '.join(ExportTarget)}")

@@ -8,21 +8,19 @@ import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from corrsfm.colmap.sqlite import copy_database
+from corrsfm.colmap.sqlite import PAIR_BASE, copy_database
 from corrsfm.errors import DatabaseError
 
 __all__ = ["convert_to_3_8", "copy_photos_of"]
 
-# A pair's id is this times the smaller image id plus the larger.
-_PAIR_BASE = 2**31 - 1
 _WGS84 = 0
 
 _DROP_OTHERS = f"""
     DELETE FROM keypoints WHERE image_id NOT IN kept;
     DELETE FROM descriptors WHERE image_id NOT IN kept;
-    DELETE FROM matches WHERE pair_id / {_PAIR_BASE} NOT IN kept OR pair_id % {_PAIR_BASE} NOT IN kept;
+    DELETE FROM matches WHERE pair_id / {PAIR_BASE} NOT IN kept OR pair_id % {PAIR_BASE} NOT IN kept;
     DELETE FROM two_view_geometries
-        WHERE pair_id / {_PAIR_BASE} NOT IN kept OR pair_id % {_PAIR_BASE} NOT IN kept;
+        WHERE pair_id / {PAIR_BASE} NOT IN kept OR pair_id % {PAIR_BASE} NOT IN kept;
     DELETE FROM pose_priors WHERE corr_sensor_type = 0 AND corr_data_id NOT IN kept;
     DELETE FROM frame_data WHERE sensor_type = 0 AND data_id NOT IN kept;
     DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data);
@@ -38,7 +36,7 @@ _SCHEMA_3_8 = f"""
         image_id INTEGER PRIMARY KEY AUTOINCREMENT NOT NULL, name TEXT NOT NULL UNIQUE,
         camera_id INTEGER NOT NULL, prior_qw REAL, prior_qx REAL, prior_qy REAL, prior_qz REAL,
         prior_tx REAL, prior_ty REAL, prior_tz REAL,
-        CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < {_PAIR_BASE}),
+        CONSTRAINT image_id_check CHECK(image_id >= 0 and image_id < {PAIR_BASE}),
         FOREIGN KEY(camera_id) REFERENCES cameras(camera_id));
     CREATE UNIQUE INDEX index_name ON images(name);
     CREATE TABLE keypoints (

@@ -1,16 +1,15 @@
-"""The verified pairs of a COLMAP database."""
+"""The verified pairs of a COLMAP database, read without changing it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import sqlite3
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors
+from corrsfm.colmap.sqlite import PAIR_BASE, open_for_reading
 from corrsfm.errors import DatabaseError
 from corrsfm.types import Pair, VerifiedPair
 
@@ -24,38 +23,33 @@ def read_verified_pairs(path: Path, pairs: Iterable[Pair] = ()) -> list[Verified
     ----------
     path : Path
     pairs : iterable of Pair
-        Further pairs to look up. COLMAP's tables do not list pairs without matches; those of ``pairs`` that
-        are on record as pruned to nothing are returned with zero matches.
+        Further pairs to look up: those of them that are on record as pruned to nothing are returned with zero
+        matches.
 
     Raises
     ------
     DatabaseError
-        If there is no such database or it is in use.
+        If there is no such database or it cannot be read.
     """
-    if not path.exists():
-        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
-    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        ids = {name: image_id for image_id, name in names.items()}
-        num_matches = dict(zip(*database.read_num_matches(), strict=True))
-        for name0, name1 in pairs:
-            known = name0 in ids and name1 in ids
-            if known and database.exists_matches(ids[name0], ids[name1]):
-                num_matches.setdefault(pycolmap.image_pair_to_pair_id(ids[name0], ids[name1]), 0)
-        num_inliers = dict(zip(*database.read_two_view_geometry_num_inliers(), strict=True))
-        verified = []
-        for pair_id in {**num_matches, **num_inliers}:
-            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
-            name0, name1 = sorted((names[id0], names[id1]))
-            verified.append(
-                VerifiedPair(
-                    name0=name0,
-                    name1=name1,
-                    num_matches=num_matches.get(pair_id, 0),
-                    num_inliers=num_inliers.get(pair_id, 0),
-                )
+    with open_for_reading(path) as database:
+        names = _names(database)
+        recorded = dict(database.execute("SELECT pair_id, rows FROM matches"))
+        num_inliers = dict(database.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0"))
+    looked_up = _ids_of_pairs(names, pairs)
+    num_matches = {pair_id: rows for pair_id, rows in recorded.items() if rows > 0 or pair_id in looked_up}
+    return sorted(
+        (
+            VerifiedPair(
+                name0=min(names_of_pair),
+                name1=max(names_of_pair),
+                num_matches=num_matches.get(pair_id, 0),
+                num_inliers=num_inliers.get(pair_id, 0),
             )
-    return sorted(verified, key=lambda pair: (pair.name0, pair.name1))
+            for pair_id in num_matches.keys() | num_inliers.keys()
+            for names_of_pair in [_names_of_pair(names, pair_id, path)]
+        ),
+        key=lambda pair: (pair.name0, pair.name1),
+    )
 
 
 def names_of_verified_pairs(path: Path) -> list[Pair]:
@@ -64,13 +58,13 @@ def names_of_verified_pairs(path: Path) -> list[Pair]:
     Raises
     ------
     DatabaseError
-        If the database cannot be read.
+        If there is no such database or it cannot be read.
     """
-    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        counts = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
-        pairs = [pycolmap.pair_id_to_image_pair(pair_id) for pair_id, num in counts if num > 0]
-    return sorted((min(names[a], names[b]), max(names[a], names[b])) for a, b in pairs)
+    with open_for_reading(path) as database:
+        names = _names(database)
+        rows = database.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0").fetchall()
+    found = (_names_of_pair(names, pair_id, path) for (pair_id,) in rows)
+    return sorted((min(pair), max(pair)) for pair in found)
 
 
 def read_verified_matches(path: Path, pairs: Iterable[Pair] | None = None) -> dict[Pair, NDArray[np.int32]]:
@@ -92,32 +86,42 @@ def read_verified_matches(path: Path, pairs: Iterable[Pair] | None = None) -> di
     DatabaseError
         If there is no such database or it cannot be read.
     """
-    if not path.exists():
-        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    query = "SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0"
     found: dict[Pair, NDArray[np.int32]] = {}
-    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
-        names = {image.image_id: image.name for image in database.read_all_images()}
-        for pair_id, geometry in _geometries(database, names, pairs):
-            if not len(geometry.inlier_matches):
-                continue
-            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
-            matches = np.asarray(geometry.inlier_matches, np.int32).reshape(-1, 2)
-            if names[id0] > names[id1]:
-                id0, id1, matches = id1, id0, matches[:, ::-1]
-            found[names[id0], names[id1]] = np.ascontiguousarray(matches)
+    with open_for_reading(path) as database:
+        names = _names(database)
+        if pairs is None:
+            stored = database.execute(query).fetchall()
+        else:
+            wanted = [(pair_id,) for pair_id in sorted(_ids_of_pairs(names, pairs))]
+            stored = [row for one in wanted for row in database.execute(f"{query} AND pair_id = ?", one)]
+    for pair_id, num, data in stored:
+        if len(data) != 8 * num:
+            raise DatabaseError(f"{path}: damaged, pair {pair_id}; delete the file and make it again")
+        name0, name1 = _names_of_pair(names, pair_id, path)
+        matches = np.frombuffer(data, "<u4").reshape(num, 2).astype(np.int32)
+        if name0 > name1:
+            name0, name1, matches = name1, name0, np.ascontiguousarray(matches[:, ::-1])
+        found[name0, name1] = matches
     return dict(sorted(found.items()))
 
 
-def _geometries(
-    database: pycolmap.Database, names: dict[int, str], pairs: Iterable[Pair] | None
-) -> Iterator[tuple[int, pycolmap.TwoViewGeometry]]:
-    """The geometries of all pairs, or of some, by COLMAP's id of the pair; its smaller image id is first."""
-    if pairs is None:
-        yield from zip(*database.read_two_view_geometries(), strict=True)
-        return
+def _names(database: sqlite3.Connection) -> dict[int, str]:
+    return dict(database.execute("SELECT image_id, name FROM images"))
+
+
+def _names_of_pair(names: dict[int, str], pair_id: int, path: Path) -> Pair:
+    """Names of a pair's photos, that of the smaller id first."""
+    try:
+        return names[pair_id // PAIR_BASE], names[pair_id % PAIR_BASE]
+    except KeyError as error:
+        raise DatabaseError(
+            f"{path}: damaged, it has no photo {error}; delete the file and make it again"
+        ) from error
+
+
+def _ids_of_pairs(names: dict[int, str], pairs: Iterable[Pair]) -> set[int]:
+    """Ids of those pairs whose photos are both known."""
     ids = {name: image_id for image_id, name in names.items()}
-    for name0, name1 in pairs:
-        if name0 in ids and name1 in ids:
-            id0, id1 = sorted((ids[name0], ids[name1]))
-            if database.exists_two_view_geometry(id0, id1):
-                yield pycolmap.image_pair_to_pair_id(id0, id1), database.read_two_view_geometry(id0, id1)
+    known = [sorted((ids[name0], ids[name1])) for name0, name1 in pairs if name0 in ids and name1 in ids]
+    return {PAIR_BASE * id0 + id1 for id0, id1 in known}

@@ -10,7 +10,18 @@ from pathlib import Path
 
 from corrsfm.errors import DatabaseError
 
-__all__ = ["copy_database", "database_errors", "is_sqlite", "is_truncated"]
+__all__ = [
+    "PAIR_BASE",
+    "copy_database",
+    "database_errors",
+    "is_sqlite",
+    "is_truncated",
+    "open_for_reading",
+]
+
+
+PAIR_BASE = 2**31 - 1
+"""COLMAP's id of a pair is this times the smaller image id plus the larger."""
 
 
 _SMALLEST_DISK_BYTES = 1 << 20
@@ -22,9 +33,12 @@ _MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100
 
 
+_PATIENCE_S = 5.0
+
+
 @contextlib.contextmanager
 def database_errors(path: Path, shown: Path | None = None) -> Iterator[None]:
-    """Translate what pycolmap says about a database into a `DatabaseError` with what to try.
+    """Translate what pycolmap or SQLite says about a database into a `DatabaseError` with what to try.
 
     Parameters
     ----------
@@ -35,8 +49,9 @@ def database_errors(path: Path, shown: Path | None = None) -> Iterator[None]:
     """
     try:
         yield
-    except RuntimeError as error:
-        explanation = _explain(path, str(error))
+    except (RuntimeError, sqlite3.Error) as error:
+        message = f"SQLite error: {error}" if isinstance(error, sqlite3.Error) else str(error)
+        explanation = _explain(path, message)
         if explanation is None:
             raise
         raise DatabaseError(f"{shown or path}: {explanation}") from error
@@ -119,12 +134,38 @@ def _is_locked(path: Path) -> bool:
         If the file is damaged.
     """
     try:
-        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True, timeout=0)) as connection:
+        uri = f"{path.absolute().as_uri()}?mode=rw"
+        with contextlib.closing(sqlite3.connect(uri, uri=True, timeout=0)) as connection:
             connection.execute("BEGIN IMMEDIATE")
             connection.rollback()
     except sqlite3.OperationalError as error:
         return "locked" in str(error)
     return False
+
+
+@contextlib.contextmanager
+def open_for_reading(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a database without changing a byte of it; pycolmap writes into what it only reads.
+
+    Parameters
+    ----------
+    path : Path
+
+    Raises
+    ------
+    DatabaseError
+        If there is no such database, or it cannot be read.
+    """
+    if not path.exists():
+        raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
+    # A log beside it holds what another program, or one that was killed, has written last.
+    in_use = any(path.with_name(path.name + suffix).exists() for suffix in ("-wal", "-journal"))
+    uri = f"{path.absolute().as_uri()}?{'mode=ro' if in_use else 'immutable=1'}"
+    with (
+        database_errors(path),
+        contextlib.closing(sqlite3.connect(uri, uri=True, timeout=_PATIENCE_S)) as connection,
+    ):
+        yield connection
 
 
 def copy_database(source: Path, target: Path) -> None:

@@ -9,13 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.images.photos import read_photo_info
 
-__all__ = ["check_photos", "copy_photos", "flat_names", "is_undistortable", "undistort"]
+__all__ = [
+    "check_photos",
+    "copy_photos",
+    "crop_to_principal_point",
+    "flat_names",
+    "is_undistortable",
+    "undistort",
+]
 
 _JPEG_QUALITY = 95
 _NUM_BORDER_SAMPLES = 33
@@ -145,6 +153,51 @@ def _as_pinhole(camera: pycolmap.Camera) -> None:
         focal, cx, cy = camera.params
         camera.model = pycolmap.CameraModelId.PINHOLE
         camera.params = [focal, focal, cx, cy]
+
+
+def crop_to_principal_point(model: pycolmap.Reconstruction, images_dir: Path) -> None:
+    """Crop photos so that the principal point is in their middle, to a quarter of a pixel.
+
+    gaussian-splatting takes it to be there, whatever the camera says.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        With PINHOLE cameras. They and the keypoints are changed in place; some of these may lie outside then.
+    images_dir : Path
+        The photos are replaced, where they are cropped.
+
+    Raises
+    ------
+    InputError
+        If a photo cannot be written.
+    """
+    for camera in model.cameras.values():
+        fx, fy, *centre = camera.params
+        size = np.array([camera.width, camera.height])
+        # Columns and rows to cut: on the left and top if positive, else on the right and bottom.
+        cut = np.rint(2 * np.array(centre) - size).astype(int)
+        if not cut.any():
+            continue
+        start, end = np.maximum(cut, 0), size + np.minimum(cut, 0)
+        for image in model.images.values():
+            if image.camera_id == camera.camera_id:
+                _crop_photo(images_dir / image.name, start, end)
+                for point in image.points2D:
+                    point.xy = point.xy - start
+        camera.width, camera.height = (int(length) for length in end - start)
+        camera.params = [fx, fy, *(centre - start)]
+
+
+def _crop_photo(path: Path, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:
+    whole = pycolmap.Bitmap.read(path, as_rgb=True)
+    if whole is not None:
+        pixels = whole.to_array()[start[1] : end[1], start[0] : end[0]]
+        cropped = pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels))
+        cropped.set_jpeg_quality(_JPEG_QUALITY)
+        if cropped.write(path, delinearize_colorspace=False):
+            return
+    raise InputError(f"{path}: cannot be cropped; free some space on the disk")
 
 
 def flat_names(names: Iterable[str]) -> dict[str, str]:

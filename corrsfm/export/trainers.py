@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.models import poses_of
 from corrsfm.export.colmap import write_three_files
-from corrsfm.export.photos import copy_photos, flat_names, undistort
+from corrsfm.export.photos import copy_photos, crop_to_principal_point, flat_names, undistort
 from corrsfm.export.world import similarity
 from corrsfm.files import atomic_write_json
 
@@ -27,12 +27,13 @@ _Z_UP_FROM_Y_DOWN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]
 
 
 def write_splat(model: pycolmap.Reconstruction, images_dir: Path, folder: Path) -> None:
-    """Undistorted photos in ``images`` and a PINHOLE model in ``sparse/0``.
+    """Undistorted photos in ``images``, a PINHOLE model in ``sparse/0`` with centred principal points.
 
     The reader of gaussian-splatting looks photos up by the last part of their name, so folders in names
     become underscores.
     """
     pinhole = undistort(model, images_dir, folder)
+    crop_to_principal_point(pinhole, folder / "images")
     names = flat_names(image.name for image in pinhole.images.values())
     for image in pinhole.images.values():
         (folder / "images" / image.name).rename(folder / "images" / names[image.name])

@@ -280,8 +280,8 @@ def _require_photos(workspace: Workspace, incoming: Sequence[Incoming], wanted: 
     check_hloc_keys(sorted({*read_index(workspace).names, *wanted}))
     if converted := [photo.name for photo in incoming if is_converted(photo.name)]:
         raise InputError(
-            f"{first_few(converted)}: cannot be added as they are, other tools do not read them; make JPEGs of "
-            "them, or put them beside the scene's photos and run the scene again"
+            f"{first_few(converted)}: cannot be added as they are, for other tools do not read them; make "
+            "JPEGs of them, or put them beside the scene's photos and run the scene again"
         )
     require_readable(incoming)
 

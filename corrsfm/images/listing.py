@@ -12,7 +12,7 @@ from corrsfm.errors import InputError, first_few
 from corrsfm.files import read_lines
 from corrsfm.images.photos import CONVERTED_SUFFIXES
 
-__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "find_masks", "list_images", "photos_below"]
+__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "find_masks", "holds_pictures", "list_images", "photos_below"]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp", *CONVERTED_SUFFIXES)
 VIDEO_SUFFIXES = (".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
@@ -89,6 +89,8 @@ def list_images(
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
         if videos := [name for name in files if name.lower().endswith(VIDEO_SUFFIXES)]:
             found += f"; to use a video give it in place of its folder: {folder / videos[0]}"
+        if not names and "workspace.json" in files:
+            found = "is a workspace; the folder of photos comes first: corrsfm run PHOTOS WORKSPACE"
         needed = "at least two overlapping photos are needed" if at_least > 1 else "expected photos"
         raise InputError(f"{where}: {found}; {needed} ({', '.join(IMAGE_SUFFIXES)})")
     return sorted(names)
@@ -112,6 +114,12 @@ def _without_twins(names: Sequence[str]) -> list[str]:
     if twins:
         logger.info("ignored %s: the same photos are there in another format", _count_suffixes(sorted(twins)))
     return [name for name in names if name not in twins]
+
+
+def holds_pictures(folder: Path) -> bool:
+    """Whether a folder or its sub-folders hold any photo or video, readable here or not."""
+    suffixes = (*IMAGE_SUFFIXES, *_FOREIGN_SUFFIXES, *VIDEO_SUFFIXES)
+    return any(name.lower().endswith(suffixes) for name in _visible_files(folder))
 
 
 def _visible_files(folder: Path) -> list[str]:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from corrsfm import config as cfg
 from corrsfm.config import config_hash
 from corrsfm.errors import WorkspaceError
+from corrsfm.files import share_file
 from corrsfm.machine import count_threads, find_device, use_threads
 from corrsfm.prune import build_pruner, make_correspondences
 from corrsfm.types import Correspondences, Matches, Pair
@@ -35,7 +36,7 @@ PAIRS_PRUNED_TOGETHER_PER_CPU_THREAD = 2
 def prune_matches(
     workspace: Workspace, config: cfg.PruneConfig, run: cfg.RunConfig, *, overwrite: bool = False
 ) -> StageOutcome:
-    """Prune the putative matches of every pair."""
+    """Prune the putative matches of every pair; those of other methods are kept for when they are wanted."""
     index = read_index(workspace)
     cameras = {record.name: index.camera_of(record) for record in index.records}
     matches = workspace.require("matches")
@@ -72,14 +73,24 @@ def prune_matches(
         return complete(
             workspace,
             "pruned matches",
-            ItemStore(workspace.pruned, PRUNED),
+            _store_of(workspace, config.method),
             wanted,
             produce,
             config,
             inputs={"matches": matches.fingerprint},
             overwrite=overwrite,
             unit="pair",
+            shown_as=workspace.pruned,
         )
+
+
+def _store_of(workspace: Workspace, method: cfg.PruneMethod) -> ItemStore[Pair, PrunedMatches]:
+    path = workspace.pruned_by(method)
+    path.parent.mkdir(exist_ok=True)
+    if not path.exists() and workspace.pruned.exists():
+        # Of a workspace that kept one method only; items of another method do not count as finished.
+        share_file(workspace.pruned, path)
+    return ItemStore(path, PRUNED)
 
 
 def _num_pruned_together(method: cfg.PruneMethod, device: str, threads: int) -> int:

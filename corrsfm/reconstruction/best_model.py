@@ -47,8 +47,9 @@ __all__ = ["SceneEvidence", "Selection", "judge_as_it_is", "policy_for", "select
 
 FIRST = "first"
 _MENDED = "+mended"
-# A small scene may try many models in seconds; a large one must not take 25 times as long.
-_MOST_TIMES, _TIMES, _SECONDS = 25.0, 2.0, 120.0
+# A large scene must not take 25 times as long; a small one is not bounded by time, on which its model would
+# depend.
+_TIMES, _SECONDS = 2.0, 120.0
 
 
 class SceneEvidence:
@@ -137,8 +138,8 @@ class Selection:
 
 
 def policy_for(max_models: int, first_seconds: float) -> ChoicePolicy:
-    """The policy within a budget: the time of two first mappings and two minutes, and of 25 at most."""
-    factor = min(_MOST_TIMES, _TIMES + _SECONDS / max(first_seconds, 1e-3))
+    """The policy within a budget: the time of two first mappings and two minutes."""
+    factor = _TIMES + _SECONDS / max(first_seconds, 1e-3)
     return ChoicePolicy(max_models=max_models, max_time_factor=factor)
 
 

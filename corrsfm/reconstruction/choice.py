@@ -232,7 +232,7 @@ def _why_stop(outcomes: Sequence[Tried | None], policy: ChoicePolicy) -> str:
         return f"the best stood for {stood} candidates"
     spent = sum(model.seconds for model in tried[1:])
     if policy.max_time_factor and spent > policy.max_time_factor * tried[0].seconds:
-        return f"the candidates took {policy.max_time_factor:g} times as long as the first model"
+        return f"the candidates took {policy.max_time_factor:.3g} times as long as the first model"
     return ""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -35,11 +35,29 @@ class MissingPhoto:
     reason : MissingReason
     detail : str
         A sentence without its full stop: the numbers behind the reason.
+    next_step : str
+        What to try so that it joins the others, likewise.
     """
 
     name: str
     reason: MissingReason
     detail: str
+    next_step: str
+
+
+# What to try: {0} is the photo, {1} it and the one that it matches best, {2} a way to more matches.
+_NEXT_STEPS = {
+    MissingReason.LEFT_OUT: "replace the file and run again",
+    MissingReason.NO_PAIR: "match it with more photos: --pairing exhaustive, or a larger --num-retrieved",
+    MissingReason.NO_MATCH: "look at the photo: a dark, blurred or plain one has hardly any keypoints",
+    MissingReason.PRUNED: "take a photo between {1}, or try --method ratio",
+    MissingReason.NOT_VERIFIED: "take a photo between {1}, or try {2}",
+    MissingReason.OTHER_MODEL: "take photos that show both models, or try {2}",
+    MissingReason.NOT_MAPPED: "run corrsfm reconstruct",
+    MissingReason.OTHER_COMPONENT: "take a photo between {0} and the model, or try {2}",
+    MissingReason.NOT_PLACED: "take a photo between {1}, or try {2}",
+}
+_MORE_PAIRS, _MORE_FEATURES = "--pairing exhaustive", "a larger --max-features"
 
 
 def missing_photos(
@@ -59,6 +77,7 @@ def missing_photos(
     }
     component_of = {name: component for component in components for name in component}
     main = _main_component(components, models)
+    all_matched = 2 * len(pairs) >= len(names) * (len(names) - 1)
     missing = []
     for name in names:
         if model_of.get(name) == 0:
@@ -66,7 +85,7 @@ def missing_photos(
         component = component_of.get(name, ())
         if name in left_out:
             reason = MissingReason.LEFT_OUT
-            detail = "replace the file and run again"
+            detail = "it cannot be read"
         elif name in model_of:
             reason = MissingReason.OTHER_MODEL
             size = models[model_of[name]].num_images
@@ -78,7 +97,12 @@ def missing_photos(
             reason, detail = MissingReason.NOT_MAPPED, _verified_pairs(name, pairs_of[name])
         else:
             reason, detail = _lost_at(name, pairs_of[name], component, main)
-        missing.append(MissingPhoto(name=name, reason=reason, detail=detail))
+        next_step = _NEXT_STEPS[reason].format(
+            name,
+            _with_best_partner(name, pairs_of[name], model_of),
+            _MORE_FEATURES if all_matched else _MORE_PAIRS,
+        )
+        missing.append(MissingPhoto(name=name, reason=reason, detail=detail, next_step=next_step))
     return tuple(missing)
 
 
@@ -123,6 +147,19 @@ def _verified_pairs(name: str, pairs: Sequence[PairStatistics]) -> str:
     num_verified = sum(pair.num_verified > 0 for pair in pairs)
     plural = "s" if num_verified > 1 else ""
     return f"{num_verified} verified pair{plural}; most matches: {_best(name, pairs, 'num_verified')}"
+
+
+def _with_best_partner(name: str, pairs: Sequence[PairStatistics], model_of: Mapping[str, int]) -> str:
+    """A photo and the one that it matches best, if possible one of the first model."""
+
+    def partner(pair: PairStatistics) -> str:
+        return pair.name1 if pair.name0 == name else pair.name0
+
+    def rank(pair: PairStatistics) -> tuple[bool, int, int, int]:
+        joins = pair.num_kept > 0 and model_of.get(partner(pair)) == 0
+        return joins, pair.num_verified, pair.num_kept, pair.num_putative
+
+    return " and ".join(sorted([name, partner(max(pairs, key=rank))])) if pairs else name
 
 
 def _best(name: str, pairs: Sequence[PairStatistics], count: str) -> str:

@@ -216,7 +216,8 @@ def plotly_view(view: ModelView) -> str:
         full_html=False,
         include_plotlyjs=True,
         include_mathjax=False,
-        default_height="min(70vh, 560px)",
+        # Never so narrow that the frame does not fit, see `_NARROWEST`.
+        default_height="min(70vh, 560px, 70vw)",
         div_id="model",
         config={
             "displaylogo": False,

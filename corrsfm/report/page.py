@@ -34,6 +34,7 @@ _MOST_LINES = (150, 60)
 _THUMBNAILS = 24
 _THUMBNAIL_SIZE = 120
 _LISTED_PAIRS = 300
+_SHOWN_STEPS = 3
 
 
 def write_html(
@@ -93,6 +94,8 @@ def _verdict(report: SceneReport) -> str:
     """The verdict on the first model, what to do about it and what it rests on, above everything else."""
     if not report.verdict:
         return ""
+    if "verdict" not in report.evidence:
+        return _no_model(report)
     verdict = report.evidence["verdict"]
     facts = []
     if (predicted := report.evidence.get("num_predicted_matches")) is not None:
@@ -108,6 +111,16 @@ def _verdict(report: SceneReport) -> str:
         + (f"<h3>What to try next</h3><ul>{steps}</ul>" if steps else "")
         + (f'<p class="note">{html.escape("; ".join(facts))}</p>' if facts else "")
         + "</div>"
+    )
+
+
+def _no_model(report: SceneReport) -> str:
+    """In place of a verdict: what most photos lack, and what to do about it."""
+    steps = list(dict.fromkeys(photo.next_step for photo in report.missing))[:_SHOWN_STEPS]
+    return (
+        f'<div class="verdict wrong"><h2>There is no model</h2>'
+        f"<ul>{_items([report.why_no_model])}</ul>"
+        f"<h3>What to try next</h3><ul>{_items(steps)}</ul></div>"
     )
 
 
@@ -173,7 +186,8 @@ def _missing_row(image: MissingPhoto, images_dir: Path | None) -> str:
     thumbnail = f'<img src="{pictures.jpeg_uri(photo[0])}" alt="">' if photo is not None else ""
     return (
         f"<tr><td>{thumbnail}</td><td>{html.escape(image.name)}</td>"
-        f"<td><b>{html.escape(image.reason)}</b><br>{html.escape(image.detail)}</td></tr>"
+        f"<td><b>{html.escape(image.reason)}</b><br>{html.escape(image.detail)}"
+        f'<br><span class="next">{html.escape(image.next_step)}</span></td></tr>'
     )
 
 

@@ -24,7 +24,7 @@ from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
 from corrsfm.workspace.lists import read_added, read_index, read_pairs
 from corrsfm.workspace.resume import photos_left_out, require_database
 from corrsfm.workspace.store import ItemStore
-from corrsfm.workspace.warned import collect_warnings, read_warnings
+from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, read_warnings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -42,7 +42,8 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     with collect_warnings() as met:
         summary, models = summarise(workspace)
     kept = read_warnings(workspace.warnings_json)
-    said = [*((stage, kept.get(stage, [])) for stage in STAGE_COMMANDS), ("report", met)]
+    stages = (BEFORE_STAGES, *STAGE_COMMANDS)
+    said = [*((stage, kept.get(stage, [])) for stage in stages), ("report", met)]
     summary = dataclasses.replace(
         summary,
         warnings=tuple(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -25,7 +26,8 @@ class StageWarning:
     Attributes
     ----------
     stage : str
-        As in `SceneReport.stage_seconds`, or "report" for what making the report met.
+        As in `SceneReport.stage_seconds`, "run" before the first of them, or "report" for what making the
+        report met.
     message : str
         May have several lines.
     """
@@ -54,7 +56,8 @@ class SceneReport:
     missing : tuple of MissingPhoto
         Photos that are not registered, sorted by name.
     stage_seconds : dict
-        Stage → seconds of wall clock it took when it was last run, in the order of the stages.
+        Stage → seconds of wall clock that what is there took to make, over all runs, in the order of the
+        stages.
     configuration : dict
         The options of the run.
     versions : dict
@@ -87,11 +90,19 @@ class SceneReport:
     @property
     def verdict(self) -> str:
         """The verdict in one line; empty if there is none."""
-        if "verdict" not in self.evidence:
+        if "verdict" in self.evidence:
+            verdict = self.evidence["verdict"]
+            step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
+            return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
+        if self.models or not self.missing:
             return ""
-        verdict = self.evidence["verdict"]
-        step = f"; try {verdict['next_steps'][0]}" if verdict["next_steps"] else ""
-        return f"{verdict['grade']}: {'; '.join(verdict['reasons'])}{step}"
+        return f"no model: {self.why_no_model}; {self.missing[0].next_step}"
+
+    @property
+    def why_no_model(self) -> str:
+        """What most photos lack, where there is no model."""
+        reason, num = Counter(photo.reason for photo in self.missing).most_common(1)[0]
+        return f"{num:,} of {len(self.image_names):,} photos: {reason}"
 
     @property
     def num_registered(self) -> int:
@@ -157,7 +168,7 @@ class SceneReport:
                 "num_verified_matches": verified,
                 "num_components": len(self.components),
                 "seconds": sum(self.stage_seconds.values()),
-                "verdict": self.evidence["verdict"]["grade"] if self.verdict else None,
+                "verdict": self.evidence.get("verdict", {}).get("grade"),
                 "explained_share": self.evidence.get("explained_share"),
                 "num_predicted_matches": self.evidence.get("num_predicted_matches"),
             },

@@ -38,12 +38,16 @@ th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-
 tr:last-child > * { border-bottom: 0; }
 th { font-weight: 500; color: var(--quiet); white-space: nowrap; }
 .numbers { margin-top: 14px; }
-.numbers th, .numbers td { text-align: right; }
+.numbers th, .numbers td { text-align: right; padding-right: 12px; }
+.numbers td { white-space: nowrap; }
+.numbers th { white-space: normal; vertical-align: bottom; }
+.numbers.names td { white-space: normal; }
 .numbers th:first-child, .numbers td:first-child, .names th:nth-child(2), .names td:nth-child(2) {
   text-align: left; }
 .missing { width: 100%; }
 .missing td:first-child { width: 1%; }
 .missing td:nth-child(2) { overflow-wrap: anywhere; }
+.missing .next::before { content: "→ "; }
 .missing img { display: block; max-width: 96px; max-height: 72px; border-radius: 4px; }
 .charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(280px, 1fr)); gap: 16px; }
 .pairs { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 440px), 1fr)); gap: 18px; }
@@ -83,7 +87,7 @@ h3 { font-size: 1rem; margin: 20px 0 4px; }
 .verdict.wrong { border-color: #d55e00; }
 .best { font-weight: 600; }
 .failure { color: #a33; }
-.numbers td.failure { text-align: left; }
+.numbers td.failure { text-align: left; white-space: normal; }
 .kept { color: #2a7fb8; }
 .dropped { color: #d55e00; }
 @media (max-width: 720px) {
@@ -91,6 +95,10 @@ h3 { font-size: 1rem; margin: 20px 0 4px; }
   section { padding: 14px 12px; }
   .graph { grid-template-columns: minmax(0, 1fr); }
   .facts th { white-space: normal; }
+  .missing tr { display: grid; grid-template-columns: 108px 1fr; border-bottom: 1px solid #eceae4; }
+  .missing tr:last-child { border-bottom: 0; }
+  .missing td { border-bottom: 0; }
+  .missing td:first-child { width: auto; grid-row: span 2; }
 }
 @media print { section { break-inside: avoid; } body { background: #ffffff; } }
 """

@@ -29,9 +29,11 @@ def format_table(report: SceneReport) -> str:
         shown = report.missing[:_MAX_MISSING]
         name_width = max(len(image.name) for image in shown)
         reason_width = max(len(image.reason) for image in shown)
-        lines += [
-            f"  {image.name:<{name_width}}  {image.reason:<{reason_width}}  {image.detail}" for image in shown
-        ]
+        for image in shown:
+            lines += [
+                f"  {image.name:<{name_width}}  {image.reason:<{reason_width}}  {image.detail}",
+                f"  {'':<{name_width}}  next: {image.next_step}",
+            ]
         if len(report.missing) > len(shown):
             lines.append(f"  … and {len(report.missing) - len(shown)} more, see report.json")
     return "\n".join(lines)

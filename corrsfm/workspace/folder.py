@@ -3,7 +3,8 @@
 ::
 
     WORKSPACE/
-    ├── workspace.json      format version, image folder, and per stage: fingerprint, options, seconds
+    ├── workspace.json      format version, image folder, per stage fingerprint, options and seconds, and what
+    │                       the items of a file took to make
     ├── frames/             frames of a video, and frames.json with their times
     ├── converted/          JPEGs of HEIC and AVIF photos, and links to the other photos
     ├── images.txt          names of the photos, one per line
@@ -13,6 +14,7 @@
     ├── pair_origins.tsv    the strategies that proposed each pair
     ├── matches.h5          putative matches
     ├── pruned.h5           matches that passed pruning
+    ├── .pruned/METHOD.h5   those of each method that was tried; pruned.h5 is the last one, by another name
     ├── cameras.json        which photos share a camera, and by what evidence
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
@@ -46,7 +48,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import FRAME_TIMES, atomic_write_json
 from corrsfm.workspace.commands import command_for, label_of
 
@@ -71,7 +73,7 @@ class StageRecord:
     inputs : dict
         Stage → fingerprint of what it read.
     seconds : float
-        Wall-clock seconds of the run that finished it.
+        Wall-clock seconds that what is there took to make, over all runs that had a part in it.
     num_items, num_reused : int
         Items of the stage, and how many of them an earlier run had done.
     """
@@ -134,6 +136,9 @@ class Workspace:
         self.report_html = root / "report.html"
         self.run_json = root / "run.json"
         self.log = root / "log.txt"
+        # What was there before this workspace was begun, and which folders were made for it; None if it was
+        # begun earlier.
+        self._begun: tuple[set[str], list[Path]] | None = None
         if not self.manifest.exists():
             self._start(create)
         self._values = self._load()
@@ -153,6 +158,9 @@ class Workspace:
                 f"{self.root}: holds {' and '.join(foreign)} of another tool; choose an empty folder, "
                 "nothing was touched"
             )
+        if not own:
+            before = set(os.listdir(self.root)) if self.root.exists() else set()
+            self._begun = before, [path for path in (self.root, *self.root.parents) if not path.exists()]
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -181,7 +189,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the workspace for this process.
+        """Hold the workspace for this process; one that was begun with unusable input vanishes again.
 
         Raises
         ------
@@ -212,7 +220,26 @@ class Workspace:
                     error.strerror,
                 )
             self._values = self._load()
-            yield
+            try:
+                yield
+            except InputError:
+                if self._begun is not None and not self._values["stages"]:
+                    self._vanish(*self._begun)
+                raise
+
+    def _vanish(self, before: set[str], made: list[Path]) -> None:
+        """Remove what making the workspace left, so that a mistyped command leaves nothing."""
+        for path in (self.manifest, self.photo_cache, self.warnings_json, self.log, self.root / ".lock"):
+            if path.name not in before:
+                path.unlink(missing_ok=True)
+        # Fails where something of use is there.
+        with contextlib.suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+
+    def pruned_by(self, method: str) -> Path:
+        """Where the kept matches of a prune method lie, whichever is the current one."""
+        return self.root / ".pruned" / f"{method}.h5"
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[None]:
@@ -297,6 +324,9 @@ class Workspace:
             Naming the command to run.
         """
         record = self.record_of(stage)
+        if record is None and stage == "models" and self.mapping_failed:
+            why = shlex.join(["corrsfm", "report", str(self.root)])
+            raise WorkspaceError(f"{self.root}: mapping gave no model; why: {why}")
         if record is None:
             raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self._remedy(stage)}")
         for name, fingerprint in record.inputs.items():
@@ -338,8 +368,16 @@ class Workspace:
             {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
         )
 
-    def finish(self, stage: str, record: StageRecord) -> None:
-        """Record a stage as finished now."""
+    def cost_of(self, path: Path) -> tuple[float, int]:
+        """Seconds that the items of a file took to make, and how many they are; zeros if it is not known."""
+        cost = self._values.get("costs", {}).get(path.relative_to(self.root).as_posix(), {})
+        return float(cost.get("seconds", 0.0)), int(cost.get("num_items", 0))
+
+    def finish(self, stage: str, record: StageRecord, made: Path | None = None) -> None:
+        """Record a stage as finished now, and its seconds as what the items of a file took."""
+        if made is not None:
+            cost = {"seconds": record.seconds, "num_items": record.num_items}
+            self._values.setdefault("costs", {})[made.relative_to(self.root).as_posix()] = cost
         if stage == "models":
             self._values.pop("mapping_failed", None)
         stamped = {**record.__dict__, "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z")}

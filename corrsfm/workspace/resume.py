@@ -10,12 +10,14 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from corrsfm import config as cfg
 from corrsfm.errors import WorkspaceError
+from corrsfm.files import share_file
 from corrsfm.types import Pair
 from corrsfm.workspace.commands import label_of
 from corrsfm.workspace.folder import StageRecord, Workspace
@@ -82,6 +84,7 @@ def complete(
     inputs: dict[str, str],
     overwrite: bool,
     unit: str,
+    shown_as: Path | None = None,
 ) -> StageOutcome:
     """Bring a store to exactly the wanted items, keeping finished ones.
 
@@ -103,6 +106,8 @@ def complete(
         Make all items again.
     unit : str
         What an item is, for the progress bar.
+    shown_as : Path, optional
+        The name under which other stages read the file, if it is not that of the store.
 
     Raises
     ------
@@ -111,35 +116,48 @@ def complete(
     """
     refuse_foreign(store.path, store.kind)
     started = time.monotonic()
+    artefact = shown_as or store.path
     fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
     finished = set() if overwrite else store.finished(wanted)
     missing = [key for key in wanted if key not in finished]
-    if not missing and workspace.is_current(stage, fingerprint, store.path):
+    if not missing and workspace.is_current(stage, fingerprint, artefact):
         store.discard_journal()
         return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
     explain(workspace, stage, config)
-    if finished and missing:
+    if finished:
         logger.info(
             "%s: %d of %d up to date, %d to do", label_of(stage), len(finished), len(wanted), len(missing)
         )
+    spent_on_items = 0.0
     try:
         with tqdm(
             total=len(wanted), initial=len(finished), desc=label_of(stage), unit=unit, leave=False
         ) as bar:
+            before = time.monotonic()
             for key, item in produce(missing):
-                store.add(key, wanted[key], item)
+                now = time.monotonic()
+                store.add(key, wanted[key], item, now - before)
+                spent_on_items += now - before
+                before = now
                 bar.update()
         workspace.forget(stage)
-        store.commit(
-            wanted, lambda keys: tqdm(keys, desc=f"writing {store.path.name}", unit=unit, leave=False)
-        )
+        cost, num_earlier = workspace.cost_of(store.path)
+        if missing or num_earlier != len(wanted) or store.journal.path.exists():
+            num_new, new_seconds = store.commit(
+                wanted, lambda keys: tqdm(keys, desc=f"writing {artefact.name}", unit=unit, leave=False)
+            )
+            # What is there cost its share of what the file had cost, the new items, and the writing now.
+            cost *= min((len(wanted) - num_new) / num_earlier, 1.0) if num_earlier else 0.0
+            cost += new_seconds + time.monotonic() - started - spent_on_items
+        if shown_as is not None:
+            share_file(store.path, shown_as)
     finally:
         store.close()
     fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
     outcome = StageOutcome(
         stage=stage, num_items=len(wanted), num_reused=len(finished), seconds=time.monotonic() - started
     )
-    finish(workspace, outcome, fingerprint, config, inputs=inputs)
+    finish(workspace, outcome, fingerprint, config, inputs=inputs, cost=cost, made=store.path)
     return outcome
 
 
@@ -149,17 +167,21 @@ def finish(
     fingerprint: str,
     config: Any,
     inputs: dict[str, str] | None = None,
+    cost: float | None = None,
+    made: Path | None = None,
 ) -> None:
+    """Record what a stage did; ``cost`` is what all of it took if earlier runs had a part in it."""
     workspace.finish(
         outcome.stage,
         StageRecord(
             fingerprint=fingerprint,
             config=cfg.to_dict(config),
             inputs=inputs or {},
-            seconds=round(outcome.seconds, 3),
+            seconds=round(outcome.seconds if cost is None else cost, 3),
             num_items=outcome.num_items,
             num_reused=outcome.num_reused,
         ),
+        made,
     )
 
 

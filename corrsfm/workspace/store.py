@@ -25,6 +25,7 @@ from corrsfm.workspace.journal import Journal
 __all__ = ["ItemStore"]
 
 FORMAT_VERSION = 1
+_SECONDS = "seconds"
 
 
 def _why_unreadable(error: OSError) -> str:
@@ -173,17 +174,20 @@ class ItemStore(Generic[K, T]):
 
     # writing ------------------------------------------------------------------------------------------------
 
-    def add(self, key: K, fingerprint: str, item: T) -> None:
-        """Put an item into the journal; it is safe when this returns.
+    def add(self, key: K, fingerprint: str, item: T, seconds: float = 0.0) -> None:
+        """Put an item, and the seconds it took, into the journal; it is safe when this returns.
 
         Raises
         ------
         WorkspaceError
             If the disk is full or the journal cannot be written.
         """
-        self.journal.add(self.kind.group(key), fingerprint, *self.kind.encode(item))
+        arrays, attributes = self.kind.encode(item)
+        self.journal.add(self.kind.group(key), fingerprint, arrays, {**attributes, _SECONDS: seconds})
 
-    def commit(self, wanted: Mapping[K, str], progress: Callable[[Iterable[K]], Iterable[K]] = iter) -> None:
+    def commit(
+        self, wanted: Mapping[K, str], progress: Callable[[Iterable[K]], Iterable[K]] = iter
+    ) -> tuple[int, float]:
         """Make the HDF5 file hold exactly the wanted items, from itself and the journal; all or nothing.
 
         Parameters
@@ -192,6 +196,13 @@ class ItemStore(Generic[K, T]):
             Key → fingerprint.
         progress : callable
             Passes the keys on one by one as they are written; for a progress bar.
+
+        Returns
+        -------
+        num_new : int
+            Items that came from the journal; the others were in the file before.
+        seconds : float
+            That these took to make, over all runs.
 
         Raises
         ------
@@ -203,7 +214,7 @@ class ItemStore(Generic[K, T]):
             with atomic_path(self.path) as temporary, h5py.File(temporary, "w") as target:
                 target.attrs["format"] = f"corrsfm-{self.kind.label}"
                 target.attrs["version"] = FORMAT_VERSION
-                self._fill(target, wanted, progress)
+                seconds = self._fill(target, wanted, progress)
         # HDF5 notices some failures of writing only when it closes the file, which is a RuntimeError.
         except (OSError, RuntimeError) as error:
             raise WorkspaceError(
@@ -211,6 +222,7 @@ class ItemStore(Generic[K, T]):
                 "finished work is kept"
             ) from error
         self.discard_journal()
+        return len(seconds), sum(seconds)
 
     def _require_space(self) -> None:
         # HDF5 may crash the process when the disk fills up. The new file is no larger than its sources.
@@ -227,17 +239,23 @@ class ItemStore(Generic[K, T]):
         target: h5py.File,
         wanted: Mapping[K, str],
         progress: Callable[[Iterable[K]], Iterable[K]],
-    ) -> None:
+    ) -> list[float]:
+        """Write all items; the seconds of those from the journal."""
+        seconds = []
         with self._open() if self.path.exists() else nullcontext() as source:
             for key in progress(wanted):
                 name, fingerprint = self.kind.group(key), wanted[key]
                 item = self.journal.read(name, fingerprint)
                 if item is not None:
-                    self._write_group(target, name, fingerprint, *item)
+                    arrays, attributes = item
+                    # Not for the file: the same input gives the same bytes.
+                    seconds.append(float(attributes.pop(_SECONDS, 0.0)))
+                    self._write_group(target, name, fingerprint, arrays, attributes)
                 elif source is not None and name in source and self._fingerprint(source, key) == fingerprint:
                     source.copy(source[name], target, name=name, shallow=False)
                 else:
                     raise WorkspaceError(f"{self.path}: {key} was never finished; run again")
+        return seconds
 
     @staticmethod
     def _write_group(

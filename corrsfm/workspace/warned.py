@@ -19,7 +19,11 @@ from corrsfm.files import atomic_write_json
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.resume import StageOutcome
 
-__all__ = ["collect_warnings", "keeps_warnings", "read_warnings"]
+__all__ = ["BEFORE_STAGES", "collect_warnings", "keep_warnings", "keeps_warnings", "read_warnings"]
+
+BEFORE_STAGES = "run"
+"""In the place of a stage: what a whole run warned of before the first one."""
+
 
 MAX_WARNINGS = 100
 MAX_CHARACTERS = 2000
@@ -92,7 +96,7 @@ def keeps_warnings(
                     is_reused = outcome.skipped and not messages
                 finally:
                     if not is_reused:
-                        _keep(workspace.warnings_json, stage, messages)
+                        keep_warnings(workspace.warnings_json, stage, messages)
             return outcome
 
         return run
@@ -100,7 +104,8 @@ def keeps_warnings(
     return decorate
 
 
-def _keep(path: Path, stage: str, messages: list[str]) -> None:
+def keep_warnings(path: Path, stage: str, messages: list[str]) -> None:
+    """Put the warnings of a stage in the place of those of its last run."""
     known = read_warnings(path)
     if known.get(stage, []) == messages:
         return

@@ -91,6 +91,16 @@ def test_splat_is_what_gaussian_splatting_and_gsplat_read(scene: FinishedScene, 
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "sparse"]
 
 
+def test_splats_principal_point_is_in_the_middle_where_the_trainer_takes_it_to_be(
+    scene: FinishedScene, tmp_path: Path
+) -> None:
+    export_scene(scene.workspace, tmp_path / "out", "splat")
+    views, _ = read_gaussian_splatting(tmp_path / "out")
+    for view in views.values():
+        _, width, height, (_, _, cx, cy) = view.camera
+        assert np.abs([cx - width / 2, cy - height / 2]).max() <= 0.25
+
+
 def test_gsplats_pycolmap_reads_splat(scene: FinishedScene, tmp_path: Path) -> None:
     export_scene(scene.workspace, tmp_path / "out", "splat")
     model = pycolmap.Reconstruction(tmp_path / "out" / "sparse" / "0")

@@ -150,6 +150,6 @@ def test_the_record_tells_which_matches_of_contradicted_pairs_are_explained(scen
 
 
 def test_a_large_scene_spends_less_on_other_models_than_a_small_one() -> None:
-    assert policy_for(24, 2.0).max_time_factor == 25.0
+    assert policy_for(24, 2.0).max_time_factor == 62.0
     assert policy_for(24, 60.0).max_time_factor == 4.0
     assert policy_for(24, 36000.0).max_time_factor == pytest.approx(2.0, abs=0.01)

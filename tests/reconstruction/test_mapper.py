@@ -16,7 +16,7 @@ from corrsfm.colmap.models import observation_errors, read_models, summarise_mod
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError, WorkspaceError
 from corrsfm.reconstruction import mapper as reconstruction
-from corrsfm.reconstruction.mapper import _ranked, reconstruct
+from corrsfm.reconstruction.mapper import _ranked, _threads_for, reconstruct
 
 MODEL_FILES = ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
 
@@ -165,12 +165,19 @@ def test_few_verified_matches_are_enough_once_verified(tmp_path: Path) -> None:
     assert summary.num_images == 12
 
 
-def test_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
-    synthesize(tmp_path / "database.db", inlier_match_ratio=0.8)
-    for name in ("first", "second"):
-        run(tmp_path / "database.db", tmp_path / name, seed=3, num_threads=1)
+def test_only_large_scenes_are_mapped_on_many_threads() -> None:
+    assert [_threads_for(num, 8) for num in (2, 200, 201)] == [1, 1, 8]
+    assert _threads_for(1000, 0) == 0
+
+
+@pytest.mark.parametrize("mapper", list(Mapper))
+def test_same_seed_gives_the_same_bytes_on_any_number_of_threads(tmp_path: Path, mapper: Mapper) -> None:
+    synthesize(tmp_path / "database.db", num_points=300, inlier_match_ratio=0.7)
+    for threads in (1, 2, 8):
+        run(tmp_path / "database.db", tmp_path / str(threads), seed=3, num_threads=threads, mapper=mapper)
     for file in MODEL_FILES:
-        assert (tmp_path / "first/0" / file).read_bytes() == (tmp_path / "second/0" / file).read_bytes(), file
+        models = {(tmp_path / str(threads) / "0" / file).read_bytes() for threads in (1, 2, 8)}
+        assert len(models) == 1, file
 
 
 def test_progress_counts_registered_photos(tmp_path: Path) -> None:
@@ -201,7 +208,7 @@ def test_killed_mapping_leaves_no_models_and_the_next_run_succeeds(tmp_path: Pat
 import os
 from pathlib import Path
 from corrsfm.config import ReconstructionConfig
-from corrsfm.reconstruction.mapper import _ranked, reconstruct
+from corrsfm.reconstruction.mapper import _ranked, _threads_for, reconstruct
 folder = Path({str(tmp_path)!r})
 reconstruct(folder / "database.db", None, folder / "sparse", config=ReconstructionConfig(),
             on_progress=lambda num: os._exit(9) if num == 6 else None)

@@ -214,6 +214,21 @@ def test_histogram_counts_every_value_once() -> None:
     assert re.findall(r"<title>(.*?)</title>", drawn) == ["0 to 1: 1", "1 to 2: 2", "2 or more: 1"]
 
 
+def test_without_a_model_the_page_says_so_above_the_numbers(tmp_path: Path) -> None:
+    pairs = [PairStatistics(name0="a<", name1="b", num_putative=50, num_kept=9, num_verified=0)]
+    write_html(
+        make_report(scene="x", image_names=["a<", "b"], pairs=pairs, models=[]), tmp_path / "page.html"
+    )
+    text = (tmp_path / "page.html").read_text()
+    verdict = (
+        '<div class="verdict wrong"><h2>There is no model</h2>'
+        "<ul><li>2 of 2 photos: too few verified matches</li></ul>"
+        "<h3>What to try next</h3>"
+        "<ul><li>take a photo between a&lt; and b, or try a larger --max-features</li></ul>"
+    )
+    assert text.index(verdict) < text.index('<div class="tiles">')
+
+
 def test_the_verdict_stands_above_the_numbers_with_what_was_tried(tmp_path: Path) -> None:
     evidence = {
         "verdict": {"grade": "doubtful", "reasons": ["9 of 10 <b>photos"], "next_steps": ["more photos"]},

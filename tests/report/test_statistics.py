@@ -90,6 +90,52 @@ def test_each_missing_photo_has_its_reason(name: str, reason: MissingReason, det
     assert (missing[name].reason, missing[name].detail) == (reason, detail)
 
 
+@pytest.mark.parametrize(
+    ("name", "next_step"),
+    [
+        ("d.jpg", "match it with more photos: --pairing exhaustive, or a larger --num-retrieved"),
+        ("e.jpg", "look at the photo: a dark, blurred or plain one has hardly any keypoints"),
+        ("f.jpg", "take a photo between a.jpg and f.jpg, or try --method ratio"),
+        ("g.jpg", "take a photo between a.jpg and g.jpg, or try --pairing exhaustive"),
+        ("h.jpg", "take photos that show both models, or try --pairing exhaustive"),
+        ("j.jpg", "take a photo between j.jpg and the model, or try --pairing exhaustive"),
+        ("m.jpg", "take a photo between b.jpg and m.jpg, or try --pairing exhaustive"),
+    ],
+)
+def test_each_missing_photo_has_a_next_step(name: str, next_step: str) -> None:
+    assert {image.name: image.next_step for image in report().missing}[name] == next_step
+
+
+def test_where_all_pairs_were_matched_features_are_what_there_can_be_more_of() -> None:
+    pairs = [pair("a", "b", 99, 99, 99), pair("a", "c", 99, 20, 0), pair("b", "c", 99, 30, 0)]
+    made = make_report(scene="", image_names="abc", pairs=pairs, models=[model("a", "b")])
+    assert made.missing[0].next_step == "take a photo between b and c, or try a larger --max-features"
+
+
+def test_the_next_photo_joins_the_model_rather_than_another_missing_photo() -> None:
+    pairs = [pair("a", "b", 99, 99, 99), pair("a", "c", 99, 5, 0), pair("c", "d", 99, 30, 0)]
+    made = make_report(scene="", image_names="abcd", pairs=pairs, models=[model("a", "b")])
+    assert [photo.next_step.split(",")[0] for photo in made.missing] == [
+        "take a photo between a and c",
+        "take a photo between c and d",
+    ]
+
+
+def test_without_a_model_the_verdict_says_what_most_photos_lack() -> None:
+    pairs = [pair("a", "b", 50, 10, 0), pair("a", "c", 50, 0, 0), pair("b", "c", 50, 0, 0)]
+    made = make_report(scene="", image_names="abc", pairs=pairs, models=[])
+    assert made.verdict == (
+        "no model: 2 of 3 photos: too few verified matches; take a photo between a and b, or try a larger "
+        "--max-features"
+    )
+    assert format_table(made).splitlines()[1] == f"verdict     {made.verdict}"
+    assert made.to_dict()["summary"]["verdict"] is None
+    unmapped = make_report(
+        scene="", image_names="ab", pairs=[pair("a", "b", 9, 9, 9)], models=[], mapped=False
+    )
+    assert unmapped.verdict == "no model: 2 of 2 photos: not mapped yet; run corrsfm reconstruct"
+
+
 def test_every_photo_is_either_registered_or_missing_with_each_reason_shown() -> None:
     names = [image.name for image in report().missing]
     assert names == NAMES[3:]
@@ -101,7 +147,8 @@ def test_a_photo_that_was_left_out_is_not_said_to_lack_keypoints() -> None:
     made = make_report(scene="", image_names="ab", pairs=[pair("a", "b", 0, 0, 0)], models=[], left_out={"b"})
     reasons = {image.name: (image.reason, image.detail) for image in made.missing}
     assert reasons["a"][0] is MissingReason.NO_MATCH
-    assert reasons["b"] == ("unreadable, left out", "replace the file and run again")
+    assert reasons["b"] == ("unreadable, left out", "it cannot be read")
+    assert made.missing[1].next_step == "replace the file and run again"
 
 
 def test_the_mapper_is_not_blamed_before_it_ran() -> None:
@@ -208,18 +255,35 @@ def test_table_is_aligned_and_complete() -> None:
             "",
             "not registered",
             "  d.jpg  no pair                    it was not matched with any photo",
+            "         next: match it with more photos: --pairing exhaustive, or a larger --num-retrieved",
             "  e.jpg  no putative match          no match in 1 pair; it may have no keypoints",
+            "         next: look at the photo: a dark, blurred or plain one has hardly any keypoints",
             "  f.jpg  pruned to nothing          "
             "no match kept in 2 pairs; most putative ones: 120 with a.jpg",
+            "         next: take a photo between a.jpg and f.jpg, or try --method ratio",
             "  g.jpg  too few verified matches   none of 1 pair verified; most kept: 9 with a.jpg",
-            "  h.jpg  in another model           "
-            "one of 2 photos of model 1; no verified pairs connect them with model 0",
-            "  i.jpg  in another model           "
-            "one of 2 photos of model 1; no verified pairs connect them with model 0",
-            "  j.jpg  in another component       verified pairs connect it with 1 other photo only",
-            "  k.jpg  in another component       verified pairs connect it with 1 other photo only",
+            "         next: take a photo between a.jpg and g.jpg, or try --pairing exhaustive",
+            *(
+                line
+                for name in ("h.jpg", "i.jpg")
+                for line in (
+                    f"  {name}  in another model           "
+                    "one of 2 photos of model 1; no verified pairs connect them with model 0",
+                    "         next: take photos that show both models, or try --pairing exhaustive",
+                )
+            ),
+            *(
+                line
+                for name in ("j.jpg", "k.jpg")
+                for line in (
+                    f"  {name}  in another component       verified pairs connect it with 1 other photo only",
+                    f"         next: take a photo between {name} and the model, or try --pairing exhaustive",
+                )
+            ),
             "  l.jpg  mapper could not place it  1 verified pair; most matches: 16 with a.jpg",
+            "         next: take a photo between a.jpg and l.jpg, or try --pairing exhaustive",
             "  m.jpg  mapper could not place it  2 verified pairs; most matches: 25 with b.jpg",
+            "         next: take a photo between b.jpg and m.jpg, or try --pairing exhaustive",
         ]
     )
 
@@ -228,4 +292,4 @@ def test_table_shows_twenty_missing_photos_at_most() -> None:
     made = make_report(scene="", image_names=[f"{i:03d}" for i in range(50)], pairs=[], models=[])
     lines = format_table(made).splitlines()
     assert lines[-1] == "  … and 30 more, see report.json"
-    assert sum("no pair" in line for line in lines) == 20
+    assert sum("no pair  " in line for line in lines) == 20

@@ -13,7 +13,7 @@ import pytest
 
 from corrsfm import config as cfg
 from corrsfm.cli import main
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.workspace import StageRecord, Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 
@@ -114,6 +114,44 @@ def test_a_folder_with_another_tools_database_is_not_touched(tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
 
 
+@pytest.mark.parametrize("present", [[], ["0.jpg", "log.txt"]])
+def test_a_workspace_begun_with_unusable_input_vanishes_and_nothing_else_does(
+    tmp_path: Path, present: list[str]
+) -> None:
+    root = tmp_path / "new" / "scene"
+    if present:
+        root.mkdir(parents=True)
+    for name in present:
+        (root / name).touch()
+    workspace = Workspace(root, create=True)
+    with pytest.raises(InputError), workspace.lock():
+        workspace.log.touch()
+        raise InputError("no photos")
+    assert sorted(path.name for path in root.glob("*")) == present
+    assert root.parent.exists() == bool(present)
+
+
+def test_unusable_input_costs_a_workspace_nothing_that_it_holds(workspace: Workspace) -> None:
+    for begun in (workspace, Workspace(workspace.root, create=True)):
+        begun.finish("features", StageRecord(fingerprint="f"))
+        with pytest.raises(InputError), begun.lock():
+            raise InputError("no photos")
+        assert begun.manifest.exists()
+    workspace.photo_cache.touch()
+    workspace.manifest.unlink()
+    again = Workspace(workspace.root, create=True)
+    with pytest.raises(InputError), again.lock():
+        raise InputError("no photos")
+    assert again.photo_cache.exists()
+
+
+def test_after_a_failed_mapping_the_report_says_why_there_are_no_models(workspace: Workspace) -> None:
+    workspace.finish("verified matches", StageRecord(fingerprint="f"))
+    workspace.put_models_aside()
+    with pytest.raises(WorkspaceError, match="mapping gave no model; why: corrsfm report "):
+        workspace.require("models")
+
+
 def test_a_workspace_without_its_manifest_goes_on(workspace: Workspace) -> None:
     for path in (workspace.images_json, workspace.database):
         path.touch()
@@ -154,7 +192,7 @@ def test_a_damaged_manifest_is_refused(workspace: Workspace, text: str) -> None:
 def test_a_second_process_cannot_lock_a_workspace(workspace: Workspace) -> None:
     code = (
         "import sys; from pathlib import Path; from corrsfm.workspace import Workspace\n"
-        "from corrsfm.errors import WorkspaceError\n"
+        "from corrsfm.errors import InputError, WorkspaceError\n"
         "try:\n"
         "    with Workspace(Path(sys.argv[1])).lock(): print('locked')\n"
         "except WorkspaceError as error: print(error)\n"

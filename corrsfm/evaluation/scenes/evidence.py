@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import json
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from corrsfm.colmap.pairs import read_verified_matches
-from corrsfm.colmap.sqlite import copy_database
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import Views
 from corrsfm.workspace import Workspace
@@ -82,10 +79,6 @@ def common_evidence(workspaces: Sequence[Workspace], *, seed: int = 0) -> Iterat
     """
     verified = {}
     for workspace in workspaces:
-        # pycolmap changes the bytes of a database that it only reads; what is measured must not change.
-        with tempfile.TemporaryDirectory() as folder:
-            copy = Path(folder) / "database.db"
-            copy_database(workspace.database, copy)
-            verified.update(read_verified_matches(copy))
+        verified.update(read_verified_matches(workspace.database))
     with ItemStore(workspaces[0].features, FEATURES).reader() as load:
         yield SceneEvidence(read_index(workspaces[0]).names, verified, load, seed=seed)

@@ -157,11 +157,17 @@ def _table(methods: dict[str, Any]) -> str:
         columns += _ONE_SEED_COLUMNS
     if all(method["ground_truth"] for method in methods.values()):
         columns += _TRUTH_COLUMNS
-    best = [_best([value(m) for m in methods.values()], sense) for _, value, _, sense in columns]
+    # A method that gave no model is not the best at anything.
+    mapped = [method for method in methods.values() if not method["failure"]]
+    best = [_best([value(method) for method in mapped], sense) for _, value, _, sense in columns]
     rows = []
     for name, method in methods.items():
+        may_win = not method["failure"]
         cells = [
-            _cell(_number(value(method), decimals), best=winner is not None and value(method) == winner)
+            _cell(
+                _number(value(method), decimals),
+                best=may_win and winner is not None and value(method) == winner,
+            )
             for (_, value, decimals, _), winner in zip(columns, best, strict=True)
         ]
         rows.append(_row(_cell(name), *cells))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from pathlib import Path
-
+from corrsfm.files import share_file
 from corrsfm.workspace import Workspace
 
 __all__ = ["KEPT_MATCHES", "PUTATIVE_MATCHES", "share_stages"]
@@ -33,7 +30,11 @@ def share_stages(base: Workspace, target: Workspace, stages: tuple[str, ...] = P
     target.images_dir = base.images_dir
     for stage in stages:
         for name in _FILES[stage]:
-            _link(getattr(base, name), getattr(target, name))
+            source, link = getattr(base, name), getattr(target, name)
+            if source.exists():
+                share_file(source, link)
+            else:
+                link.unlink(missing_ok=True)
         record = base.require(stage)
         known = target.record_of(stage)
         if known is None or known.fingerprint != record.fingerprint:
@@ -47,16 +48,3 @@ _FILES = {
     "matches": ("matches",),
     "pruned matches": ("pruned",),
 }
-
-
-def _link(source: Path, link: Path) -> None:
-    if link.exists() and source.exists() and os.path.samefile(source, link):
-        return
-    link.unlink(missing_ok=True)
-    if not source.exists():
-        return
-    try:
-        os.link(source, link)
-    except OSError:
-        # Some file systems have no hard links.
-        shutil.copy2(source, link)

@@ -17,6 +17,7 @@ from corrsfm.cli import main
 from corrsfm.errors import ConfigError, InputError, ReconstructionError
 from corrsfm.evaluation.records import load_results
 from corrsfm.evaluation.scenes.compare import compare_methods, method_folder
+from corrsfm.evaluation.scenes.page import _table
 from corrsfm.evaluation.scenes.sharing import share_stages
 from corrsfm.evaluation.tables import render_table
 from corrsfm.reconstruction import stage as reconstruction_stage
@@ -210,6 +211,19 @@ def test_failed_mapping_is_a_result_with_its_reason(tmp_path: Path):
     assert "| ratio | 0 (0) | 0 (0) | 0 (0) | 0 (0) | 2 failed |" in render_table(
         {"kind": "compare", **values}
     )
+
+
+def test_a_method_that_failed_is_the_best_at_nothing():
+    def method(failure: str | None, value: float) -> dict:
+        keys = ("num_kept_matches", "num_verified_pairs", "inlier_ratio", "num_registered", "num_models")
+        keys += ("num_points", "mean_track_length", "mean_error_px")
+        seconds = dict.fromkeys(("prune", "verify", "map"), 9 - value)
+        numbers = {key: None if failure and key.startswith("mean") else value for key in keys}
+        return {"failure": failure, "seconds": seconds, "seeds": [{}, {}], "ground_truth": None, **numbers}
+
+    table = _table({"worst": method(None, 1), "better": method(None, 2), "failed": method("no model", 3)})
+    rows = [row.count("class='best'") for row in table.split("<tr>")[2:]]
+    assert rows == [0, 8, 0, 0]
 
 
 def test_changed_features_reach_every_method(tmp_path: Path):
