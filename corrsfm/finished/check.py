@@ -299,10 +299,10 @@ def _model(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:
 
 
 def _verdict(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:
-    """What the verdict says, unless the model is good."""
-    if not report.verdict or report.evidence["verdict"]["grade"] == "good":
+    """What the verdict says, unless there is nothing to do about it."""
+    verdict = report.evidence.get("verdict")
+    if verdict is None or not verdict["next_steps"]:
         return []
-    verdict = report.evidence["verdict"]
     advice = "; or ".join(verdict["next_steps"])
     step = f"try {advice}"
     if "--max-models-tried" in advice:
