@@ -167,7 +167,7 @@ class MatchesConfig:
     """Nearest-neighbour matching of descriptors."""
 
     block_size: int = option(
-        4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
+        4096, "Descriptors compared at a time; bounds memory", minimum=64, affects_result=False
     )
 
 
