@@ -35,8 +35,10 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
     """
     _give_back_termination()
     log = pycolmap.logging
-    before = (log.minloglevel, log.alsologtostderr, log.logtostderr)
+    before = (log.minloglevel, log.alsologtostderr, log.logtostderr, log.stderrthreshold)
     log.alsologtostderr = log.logtostderr = False
+    # Errors go to the terminal too unless this is higher; those that matter are told in our words.
+    log.stderrthreshold = _SILENT
     log.minloglevel = _SILENT if log_file is None else 0
     try:
         if log_file is None:
@@ -54,7 +56,7 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
                     log.set_log_destination(log.INFO, "")
                     _append(sorted(Path(folder).iterdir()), log_file)
     finally:
-        log.minloglevel, log.alsologtostderr, log.logtostderr = before
+        log.minloglevel, log.alsologtostderr, log.logtostderr, log.stderrthreshold = before
 
 
 def _give_back_termination() -> None:

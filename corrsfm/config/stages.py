@@ -244,7 +244,7 @@ class MatchesConfig:
         "features of aliked or disk",
     )
     block_size: int = option(
-        4096, "Descriptors compared at a time; bounds memory", minimum=1, affects_result=False
+        4096, "Descriptors compared at a time; bounds memory", minimum=64, affects_result=False
     )
 
 

@@ -85,6 +85,11 @@ def list_images(
             f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot:"
             f" {first_few(map(ascii, separating))}; rename them"
         )
+    special = [name for name in names if (folder / name).exists() and not (folder / name).is_file()]
+    if special:
+        raise InputError(
+            f"{folder}: pipes, devices or folders are named like photos: {first_few(special)}; remove them"
+        )
     if len(names) < at_least:
         found = f"the only photo is '{names[0]}'" if names else f"no photos, {_census(files)}"
         if videos := [name for name in files if name.lower().endswith(VIDEO_SUFFIXES)]:

@@ -213,7 +213,7 @@ def sequential_pairs(names: Sequence[str], overlap: int, *, quadratic: bool = Fa
         Also pair photos 2, 4, 8 … apart.
     """
     order = natural_order(names)
-    distances = set(range(1, overlap + 1))
+    distances = set(range(1, min(overlap, len(names)) + 1))
     if quadratic:
         distances.update(1 << power for power in range(len(names).bit_length()))
     return {

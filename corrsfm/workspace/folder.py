@@ -197,7 +197,9 @@ class Workspace:
             If another process holds it, or nothing can be written there.
         """
         try:
-            handle = open(self.root / ".lock", "w", encoding="utf-8")  # noqa: SIM115
+            # A link in its place could lead to any file.
+            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+            handle = os.fdopen(os.open(self.root / ".lock", flags, 0o666), "r+")
         except OSError as error:
             raise WorkspaceError(
                 f"{self.root}: nothing can be written there ({error.strerror}); check the permissions, or "

@@ -44,6 +44,13 @@ def _why_unreadable(error: OSError) -> str:
     return f"cannot be read ({error}); check the disk and run again"
 
 
+def _own(dataset: h5py.Dataset, file: h5py.File) -> h5py.Dataset:
+    """A dataset that lies in a file; refuses one that would be read from another, which may be any file."""
+    if dataset.is_virtual or dataset.external or dataset.file.filename != file.filename:
+        raise ValueError("its values lie in another file")
+    return dataset
+
+
 class ItemStore(Generic[K, T]):
     """Items of one kind in an HDF5 file, with a journal of those finished since it was written.
 
@@ -92,7 +99,11 @@ class ItemStore(Generic[K, T]):
                 group = self._group(file, key)
                 try:
                     return self.kind.decode(
-                        {name: value[()] for name, value in group.items() if isinstance(value, h5py.Dataset)},
+                        {
+                            name: _own(value, file)[()]
+                            for name, value in group.items()
+                            if isinstance(value, h5py.Dataset)
+                        },
                         group.attrs,
                     )
                 except OSError as error:

@@ -7,6 +7,7 @@ import cv2  # noqa: F401  (before pycolmap)
 import pycolmap
 import pytest
 
+from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.pairs import read_verified_pairs
 from corrsfm.colmap.sqlite import is_truncated
 from corrsfm.errors import DatabaseError
@@ -22,6 +23,13 @@ def test_termination_is_quiet():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
     assert done.returncode == -signal.SIGTERM
     assert done.stderr == b""
+
+
+def test_errors_go_to_the_file_alone(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    with colmap_log(tmp_path / "log.txt"):
+        pycolmap.logging.error("no model")
+    assert capfd.readouterr() == ("", "")
+    assert "no model" in (tmp_path / "log.txt").read_text()
 
 
 def test_a_database_without_its_end_is_told_from_whole_ones_and_other_files(tmp_path: Path) -> None:

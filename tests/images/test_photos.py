@@ -343,3 +343,11 @@ def test_unreadable_photos_are_left_out_on_request(tmp_path: Path, caplog: pytes
     records, _ = index_images(tmp_path, ImagesConfig(skip_unreadable=True))
     assert [record.name for record in records] == ["a.png", "b.png"]
     assert "broken.jpg" in caplog.text
+
+
+def test_a_pipe_named_like_a_photo_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    for name in ("a.jpg", "b.jpg"):
+        (tmp_path / name).touch()
+    os.mkfifo(tmp_path / "c.jpg")
+    with pytest.raises(InputError, match=r"pipes, devices or folders are named like photos: c\.jpg; remove"):
+        list_images(tmp_path)

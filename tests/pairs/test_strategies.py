@@ -177,6 +177,8 @@ def test_a_sequence_pairs_neighbours() -> None:
 
 def test_a_sequence_may_be_shorter_than_its_overlap() -> None:
     assert sequential_pairs(["a", "b", "c"], 10, quadratic=True) == {(0, 1), (0, 2), (1, 2)}
+    # Counted up to, it would take an hour.
+    assert sequential_pairs(["a", "b", "c"], 2**31 - 1) == {(0, 1), (0, 2), (1, 2)}
 
 
 def test_spatial_pairs_are_near_by_the_metre() -> None:

@@ -155,6 +155,14 @@ def test_after_a_failed_mapping_the_report_says_why_there_are_no_models(workspac
         workspace.require("models")
 
 
+def test_a_link_in_the_place_of_the_lock_is_not_followed(workspace: Workspace, tmp_path: Path) -> None:
+    (tmp_path / "diary").write_text("precious")
+    (workspace.root / ".lock").symlink_to(tmp_path / "diary")
+    with pytest.raises(WorkspaceError, match="nothing can be written there"), workspace.lock():
+        pass
+    assert (tmp_path / "diary").read_text() == "precious"
+
+
 def test_a_workspace_without_its_manifest_goes_on(workspace: Workspace) -> None:
     for path in (workspace.images_json, workspace.database):
         path.touch()

@@ -345,3 +345,28 @@ def test_names_that_hloc_cannot_tell_apart_are_refused() -> None:
     check_hloc_keys(["a/1.jpg", "b/1.jpg"])
     with pytest.raises(InputError, match=r"a/1\.jpg.*a-1\.jpg"):
         check_hloc_keys(["a/1.jpg", "a-1.jpg"])
+
+
+@pytest.mark.parametrize("way", ["group", "dataset", "raw", "virtual"])
+def test_values_are_never_read_from_another_file(store: ItemStore, tmp_path: Path, way: str) -> None:
+    store.add("a.jpg", "f", make_features(4))
+    store.commit({"a.jpg": "f"})
+    other = tmp_path / "other.h5"
+    shutil.copy(store.path, other)
+    secret = tmp_path / "secret"
+    secret.write_bytes(bytes(range(16)))
+    with h5py.File(store.path, "r+") as file:
+        del file["a.jpg"]["scores"]
+        if way == "group":
+            del file["a.jpg"]
+            file["a.jpg"] = h5py.ExternalLink("other.h5", "a.jpg")
+        elif way == "dataset":
+            file["a.jpg"]["scores"] = h5py.ExternalLink("other.h5", "a.jpg/scores")
+        elif way == "raw":
+            file["a.jpg"].create_dataset("scores", (4,), np.float32, external=[(str(secret), 0, 16)])
+        else:
+            layout = h5py.VirtualLayout((4,), np.float32)
+            layout[:] = h5py.VirtualSource(other, "a.jpg/scores", (4,))
+            file["a.jpg"].create_virtual_dataset("scores", layout)
+    with pytest.raises(WorkspaceError, match="a.jpg: its values lie in another file; move the file away"):
+        store.read("a.jpg")
