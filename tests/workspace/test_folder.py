@@ -95,6 +95,8 @@ def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspa
             changed[key] = others.get(type(value), "x") if not isinstance(value, str | list) else value
             if isinstance(value, bool):
                 changed[key] = not value
+            if key == "max_ratio":  # a number that is None by default
+                changed[key] = 0.5
             num_flags += changed[key] != value
         workspace.finish(name, StageRecord(fingerprint="f", config=changed))
     assert num_flags > 20
