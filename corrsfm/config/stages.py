@@ -271,7 +271,7 @@ class PruneConfig:
         "sfm keeps what mapping can use; pose is strict, for two-view poses",
         used_with=_NETWORK,
     )
-    # On validation pairs with ALIKED every ratio up to 0.95 lost poses against none, see docs/guide.md.
+    # With ALIKED every ratio up to 0.95 lost poses against none, see results/aliked_val_pose.json.
     max_ratio: float | None = option(
         None,
         "Largest descriptor distance ratio of the ratio test; if not given 0.8 for SIFT, and mutual matches "

@@ -19,7 +19,12 @@ from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
-from corrsfm.workspace.imported import imported_features, imported_from, refuse_foreign
+from corrsfm.workspace.imported import (
+    imported_features,
+    imported_from,
+    refuse_foreign,
+    traits_to_come,
+)
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
 from corrsfm.workspace.store import ItemStore
@@ -42,12 +47,15 @@ def extract_features(
         Naming every photo that cannot be read; the features of the others are kept.
     WorkspaceError
         If the features were imported and a photo has none.
+    ConfigError
+        If they were imported and others are asked for.
     """
     index = read_index(workspace)
     images = workspace.require("images")
     store = ItemStore(workspace.features, FEATURES)
     refuse_foreign(workspace.features, FEATURES)
     if (source := imported_from(workspace, "features")) is not None:
+        traits_to_come(workspace, config, cfg.MatchesConfig())
         return complete(
             workspace,
             "features",

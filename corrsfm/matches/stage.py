@@ -11,7 +11,7 @@ from corrsfm.matches.nearest import Matcher
 from corrsfm.types import Matches, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES
-from corrsfm.workspace.imported import imported_from, imported_matches, traits_of
+from corrsfm.workspace.imported import imported_from, imported_matches, traits_with
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.warned import keeps_warnings
@@ -28,8 +28,11 @@ def match_pairs(
     Raises
     ------
     ConfigError
-        If the matcher does not know the features, or is not installed.
+        If the matcher does not know the features, or the matches were imported.
+    DependencyError
+        If the matcher is not installed.
     """
+    kind = traits_with(workspace, config).features
     features = workspace.require("features")
     pairs = workspace.require("pairs")
     store = ItemStore(workspace.matches, MATCHES)
@@ -40,7 +43,6 @@ def match_pairs(
             workspace, "matches", store, wanted, lambda missing: [], source,
             inputs=inputs, overwrite=False, unit="pair",
         )  # fmt: skip
-    kind = traits_of(workspace).features
     device = find_device(run.device)
     # On a CPU each thread takes its own pair: threads that share one wait for each other at every step.
     on_cpu = device == "cpu"

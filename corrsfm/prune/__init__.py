@@ -97,7 +97,7 @@ def build_pruner(
     Parameters
     ----------
     config : PruneConfig
-    traits : MatchTraits
+    traits : MatchTraits, optional
         What the matches to prune carry; taken for SIFT's, and not compared with the network, if not given.
     device : str
         Device of the network: auto, cpu, cuda or cuda:N.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 
@@ -29,6 +30,7 @@ __all__ = [
     "refuse_foreign_files",
     "traits_of",
     "traits_to_come",
+    "traits_with",
 ]
 
 _IMPORTED = "imported"
@@ -94,13 +96,20 @@ def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg
 
 def traits_of(workspace: Workspace) -> cfg.MatchTraits:
     """What the matches of a workspace carry."""
-    records = {stage: workspace.record_of(stage) for stage in ("features", "matches")}
-    recorded = {stage: record.config if record else {} for stage, record in records.items()}
-    features = cfg.FeaturesConfig()
-    if (extractor := recorded["features"].get("extractor")) is not None:
-        features = cfg.FeaturesConfig(extractor=cfg.Extractor(extractor))
-    matcher = cfg.Matcher(recorded["matches"].get("matcher", cfg.Matcher.NEAREST))
-    return traits_to_come(workspace, features, cfg.MatchesConfig(matcher=matcher))
+    matcher = cfg.Matcher(_recorded(workspace, "matches").get("matcher", cfg.Matcher.NEAREST))
+    return traits_with(workspace, cfg.MatchesConfig(matcher=matcher))
+
+
+def traits_with(workspace: Workspace, matches: cfg.MatchesConfig) -> cfg.MatchTraits:
+    """What the matches of the features of a workspace carry; raises as `traits_to_come`."""
+    extractor = cfg.Extractor(_recorded(workspace, "features").get("extractor", cfg.Extractor.OPENCV))
+    return traits_to_come(workspace, cfg.FeaturesConfig(extractor=extractor), matches)
+
+
+def _recorded(workspace: Workspace, stage: str) -> dict[str, Any]:
+    """The options that a stage recorded; those of imported items are not among them."""
+    record = workspace.record_of(stage)
+    return record.config if record is not None else {}
 
 
 def traits_to_come(

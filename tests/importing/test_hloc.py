@@ -281,3 +281,18 @@ def test_a_foreign_file_put_into_a_workspace_is_not_overwritten(
     write_features(workspace.features, names)
     with pytest.raises(WorkspaceError, match="another tool wrote it"):
         pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN, overwrite=True)
+
+
+def test_lightglue_is_not_asked_for_features_that_it_does_not_know(
+    photos: Path, features: Path, names: list[str], tmp_path: Path
+) -> None:
+    lightglue = cfg.MatchesConfig(matcher=cfg.Matcher.LIGHTGLUE)
+    import_features(photos, tmp_path / "scene", features=features)
+    workspace = Workspace(tmp_path / "scene")
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+    with pytest.raises(ConfigError, match="lightglue has weights for aliked and disk"):
+        pipeline.match_pairs(workspace, lightglue, RUN)
+    write_matches(tmp_path / "matches.h5", [(names[0], names[1])])
+    import_features(photos, tmp_path / "other", features=features, matches=tmp_path / "matches.h5")
+    with pytest.raises(ConfigError, match="matches were imported and are kept"):
+        pipeline.match_pairs(Workspace(tmp_path / "other"), lightglue, RUN)

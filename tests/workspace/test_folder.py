@@ -98,6 +98,8 @@ def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspa
                 changed[key] = others.get(type(value), not_given.get(key, "x"))
             if isinstance(value, bool):
                 changed[key] = not value
+            if key == "max_ratio":  # a number that is None by default
+                changed[key] = 0.5
             num_flags += changed[key] != value
         workspace.finish(name, StageRecord(fingerprint="f", config=changed))
     assert num_flags > 20
