@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors
+from corrsfm.reconstruction.cache import load_cache
 from corrsfm.reconstruction.calibration import adjust, refine
 from corrsfm.reconstruction.resection import Landmarks, Resection, find_sightings, resect
 from corrsfm.types import Pair
@@ -93,9 +93,8 @@ def grow(
     num_points = grown.num_points3D()
     registered: dict[str, Resection] = {}
     failed: dict[str, Resection] = {}
-    with colmap_log(), database_errors(database):
-        with pycolmap.Database.open(database) as tables:
-            cache = pycolmap.DatabaseCache.create(tables, pycolmap.DatabaseCacheOptions())
+    cache = load_cache(database, model)
+    with colmap_log():
         mapper = pycolmap.IncrementalMapper(cache)
         mapper.begin_reconstruction(grown)
         try:
