@@ -12,7 +12,6 @@ import dataclasses
 import json
 import logging
 import os
-import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,22 +22,27 @@ import numpy as np
 import pycolmap
 
 from corrsfm import config as cfg
-from corrsfm.colmap.cameras import camera_from_pycolmap, with_focal_length
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import read_models
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
-from corrsfm.errors import InputError, WorkspaceError, first_few
+from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
-from corrsfm.files import atomic_path, atomic_write_json, sha256_of
+from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.finished.advice import next_step
-from corrsfm.finished.incoming import Incoming, PhotoPaths, find_photos, require_readable
+from corrsfm.finished.arrival import (
+    Pending,
+    copy_photos,
+    pending_addition,
+    refuse_what_cannot_join,
+    require_folder,
+    sort_out,
+)
+from corrsfm.finished.grown_lists import cameras_of_new, grown_index
+from corrsfm.finished.incoming import PhotoPaths, find_photos, refuse_imported, require_readable
 from corrsfm.images.cache import PhotoCache
-from corrsfm.images.cameras import assign_cameras
-from corrsfm.images.convert import is_converted
 from corrsfm.images.index import duplicate_images, name_remarks
-from corrsfm.images.listing import find_masks
 from corrsfm.images.stage import fingerprint_of as index_fingerprint
 from corrsfm.machine import count_threads, find_device
 from corrsfm.matches.stage import match_pairs
@@ -48,14 +52,13 @@ from corrsfm.prune.stage import prune_matches
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
 from corrsfm.reconstruction.growth import grow
 from corrsfm.reconstruction.record import record_of
-from corrsfm.reconstruction.resection import Resection, camera_in_model, focal_of_photos
+from corrsfm.reconstruction.resection import Resection
 from corrsfm.reconstruction.stage import fingerprint_of as models_fingerprint
 from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
-from corrsfm.types import Camera, ImageRecord, Pair, PairList
+from corrsfm.types import Pair, PairList
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.commands import STAGE_COMMANDS
-from corrsfm.workspace.hloc import FEATURES, PRUNED, check_hloc_keys
+from corrsfm.workspace.hloc import FEATURES, PRUNED
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_index, write_pairs
 from corrsfm.workspace.resume import StageOutcome, finish, photos_left_out
 from corrsfm.workspace.store import ItemStore
@@ -164,9 +167,10 @@ def add_photos(
     scene = Workspace(Path(workspace))
     with scene.lock():
         run = _with_seed(run or cfg.RunConfig(), scene)
-        pending = _pending_addition(scene)
+        refuse_imported(scene)
+        pending = pending_addition(scene)
         find_device(run.device)
-        incoming, already = _sort_out(find_photos(photos, scene.images_dir), scene, pending.photos)
+        incoming, already = sort_out(find_photos(photos, scene.images_dir), scene, pending.photos)
         wanted = {**pending.photos, **{photo.name: photo.sha256 for photo in incoming}}
         if not wanted:
             if not already:
@@ -174,11 +178,16 @@ def add_photos(
                     f"{scene.root}: no photos to add were named; try: corrsfm add {scene.root} NEW"
                 )
             return AddResult(photos=(), already_there=already)
-        _require_photos(scene, incoming, wanted)
-        pending = dataclasses.replace(pending, photos=wanted)
+        require_folder(scene, incoming, wanted)
+        refuse_what_cannot_join(incoming)
+        require_readable(incoming)
+        pending = dataclasses.replace(pending, photos=wanted, refine=refine or pending.refine)
+        addition = _Addition(scene, pending, run)
+        # Whatever does not fit is refused before anything is changed.
+        addition.grown_index({photo.name: photo.path for photo in incoming})
         atomic_write_json(scene.adding, dataclasses.asdict(pending))
-        _copy(incoming, scene.images_dir)
-        return _Addition(scene, pending, refine, run).finish(already)
+        copy_photos(incoming, scene.images_dir)
+        return addition.finish(already)
 
 
 def _with_seed(run: cfg.RunConfig, workspace: Workspace) -> cfg.RunConfig:
@@ -190,126 +199,14 @@ def _with_seed(run: cfg.RunConfig, workspace: Workspace) -> cfg.RunConfig:
     return dataclasses.replace(run, seed=run.seed or int(seed))
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Pending:
-    """What `adding.json` keeps of an addition until it has finished.
-
-    Attributes
-    ----------
-    photos : dict of str to str
-        New photo → hash of its bytes.
-    options : dict
-        Stage → its options. A stage that is interrupted while it writes has no record for a moment.
-    """
-
-    photos: dict[str, str]
-    options: dict[str, dict[str, Any]]
-
-
-def _pending_addition(workspace: Workspace) -> _Pending:
-    """The addition that was interrupted, or one without photos yet.
-
-    Raises
-    ------
-    WorkspaceError
-        If nothing was interrupted and the scene has no current model.
-    """
-    try:
-        pending = _Pending(**json.loads(workspace.adding.read_text(encoding="utf-8")))
-    except FileNotFoundError:
-        workspace.require("models")
-        return _Pending(
-            photos={}, options={stage: workspace.require(stage).config for stage in STAGE_COMMANDS}
-        )
-    except (OSError, ValueError, TypeError) as error:
-        raise WorkspaceError(
-            f"{workspace.adding}: damaged ({error}); delete it, and do everything again with corrsfm run"
-        ) from error
-    logger.info("going on with the addition of %s", first_few(pending.photos))
-    return pending
-
-
-def _sort_out(
-    found: Sequence[Incoming], workspace: Workspace, pending: Mapping[str, str]
-) -> tuple[list[Incoming], tuple[str, ...]]:
-    """The photos that are new, and the names of those that the scene holds already.
-
-    Raises
-    ------
-    InputError
-        Naming photos whose name another photo has.
-    """
-    known = {record.name: record.sha256 for record in read_index(workspace).records}
-    new, already, taken = [], [], []
-    for photo in found:
-        place = workspace.images_dir / photo.name
-        there = pending.get(photo.name) or known.get(photo.name)
-        if there is None and place.is_file():
-            there = sha256_of(place)
-        if there not in (None, photo.sha256):
-            taken.append(f"{photo.path}: the scene has another photo of the name {photo.name}")
-        elif photo.name in known and photo.name not in pending:
-            already.append(photo.name)
-        else:
-            new.append(photo)
-    if taken:
-        raise InputError("\n".join(taken) + "\nrename them and add them again; nothing was changed")
-    return new, tuple(already)
-
-
-def _require_photos(workspace: Workspace, incoming: Sequence[Incoming], wanted: Mapping[str, str]) -> None:
-    """Check that every photo that is needed can be read, before anything is changed.
-
-    Raises
-    ------
-    InputError
-        Naming those that cannot, and photos of the scene that are gone or were changed.
-    """
-    folder = workspace.images_dir
-    if not folder.is_dir():
-        raise InputError(
-            f"{folder}: the folder of the scene's photos is not there; mount it, or say where it is with: "
-            + workspace.command_for("images", images_dir="NEWDIR")
-        )
-    named = {photo.name for photo in incoming}
-    lost = [name for name in wanted if name not in named and not (folder / name).is_file()]
-    if lost:
-        raise InputError(
-            f"{folder}: photos of the interrupted addition are not there: {first_few(lost)}; name them again"
-        )
-    check_hloc_keys(sorted({*read_index(workspace).names, *wanted}))
-    if converted := [photo.name for photo in incoming if is_converted(photo.name)]:
-        raise InputError(
-            f"{first_few(converted)}: cannot be added as they are, for other tools do not read them; make "
-            "JPEGs of them, or put them beside the scene's photos and run the scene again"
-        )
-    require_readable(incoming)
-
-
-def _copy(incoming: Sequence[Incoming], folder: Path) -> None:
-    """Copy the photos that lie elsewhere into the folder of the scene's photos."""
-    outside = [photo for photo in incoming if not (folder / photo.name).is_file()]
-    for photo in outside:
-        try:
-            with atomic_path(folder / photo.name) as temporary:
-                shutil.copy2(photo.path, temporary)
-        except OSError as error:
-            raise InputError(
-                f"{folder / photo.name}: cannot be written ({error.strerror}); put the new photos into the "
-                f"folder of the scene's photos yourself and run the same command on them there"
-            ) from error
-    if outside:
-        logger.info("copied to %s: %s", folder, first_few(photo.name for photo in outside))
-
-
 class _Addition:
     """The stages of one addition, each of which does nothing if it is done."""
 
-    def __init__(self, workspace: Workspace, pending: _Pending, refine: bool, run: cfg.RunConfig) -> None:
+    def __init__(self, workspace: Workspace, pending: Pending, run: cfg.RunConfig) -> None:
         self._workspace = workspace
         self._new = sorted(pending.photos)
         self._recorded = pending.options
-        self._refine = refine
+        self._refine = pending.refine
         self._run = run
 
     def _options(self, stage: str, options: type[T]) -> T:
@@ -340,42 +237,56 @@ class _Addition:
     def _say(outcome: StageOutcome) -> None:
         logger.info("%s", outcome)
 
+    def grown_index(self, paths: Mapping[str, Path]) -> Index:
+        """The list of photos with the new ones, which may lie elsewhere still; raises as `grown_index`."""
+        workspace = self._workspace
+        index, folder = read_index(workspace), workspace.images_dir
+        fresh = {name: paths.get(name, folder / name) for name in self._new if name not in index.names}
+        config = self._options("images", cfg.ImagesConfig)
+        cache = PhotoCache(workspace.photo_cache)
+        return grown_index(index, fresh, folder, config, cache) if fresh else index
+
     def _index(self) -> StageOutcome:
         """List the new photos, with cameras of photos like them."""
         workspace, started = self._workspace, time.monotonic()
-        index = read_index(workspace)
-        grown = index
-        fresh = sorted(set(self._new) - set(index.names))
+        num_before = len(read_index(workspace).records)
         config = self._options("images", cfg.ImagesConfig)
-        if fresh:
-            cache = PhotoCache(workspace.photo_cache)
-            grown = _grown_index(index, fresh, workspace.images_dir, config, cache)
-            cache.save()
-            if config.image_list is not None:
-                logger.warning(
-                    "the photos of this scene were chosen by --image-list %s: put the new names into it, or "
-                    "the next run leaves them out",
-                    config.image_list,
-                )
-            elif workspace.images_dir.resolve() not in [
-                Path(given).resolve() for given in workspace.given_photos
-            ]:
-                logger.warning(
-                    "this scene was made of %s: the next run takes what that holds, without the new photos",
-                    first_few(workspace.given_photos),
-                )
+        grown = self.grown_index({})
+        num_fresh = len(grown.records) - num_before
+        if num_fresh:
+            self._warn_of_names(grown, config)
             write_index(workspace, grown)
         outcome = StageOutcome(
             stage="images",
             num_items=len(grown.records),
-            num_reused=len(grown.records) - len(fresh),
+            num_reused=num_before,
             seconds=time.monotonic() - started,
-            skipped=not fresh,
+            skipped=not num_fresh,
         )
         # An interruption may have come between the list and its record.
         if not workspace.is_current("images", index_fingerprint(grown), workspace.images_json):
             finish(workspace, outcome, index_fingerprint(grown), config)
         return outcome
+
+    def _warn_of_names(self, grown: Index, config: cfg.ImagesConfig) -> None:
+        """What other programs, or the next run, would make of the new names."""
+        for remark in name_remarks(self._new):
+            logger.warning("%s", remark)
+        for equal in duplicate_images(grown.records):
+            if not set(self._new).isdisjoint(equal):
+                logger.warning("photos with the same content: %s", ", ".join(equal))
+        if config.image_list is not None:
+            logger.warning(
+                "the photos of this scene were chosen by --image-list %s: put the new names into it, or the "
+                "next run leaves them out",
+                config.image_list,
+            )
+        given = self._workspace.given_photos
+        if self._workspace.images_dir.resolve() not in [Path(photos).resolve() for photos in given]:
+            logger.warning(
+                "this scene was made of %s: the next run takes what that holds, without the new photos",
+                first_few(given),
+            )
 
     def _pairs(self) -> StageOutcome:
         """Add the pairs of the new photos to the list."""
@@ -430,7 +341,7 @@ class _Addition:
             add_to_database(
                 workspace.database,
                 images=[record for record in index.records if record.name in fresh],
-                cameras=_cameras_of_new(workspace, index, self._new),
+                cameras=cameras_of_new(workspace, index, self._new),
                 features=read_features,
                 kept=((*pair, read_pruned(pair).indices) for pair in of_new),
                 config=config,
@@ -474,8 +385,7 @@ class _Addition:
                 workspace.database,
                 matches,
                 known_focal=known_focal,
-                refine=self._refine,
-                refine_principal_point=config.refine_principal_point,
+                refinement=_refinement(config, count_threads(run.threads)) if self._refine else None,
                 seed=run.seed,
                 num_threads=count_threads(run.threads),
             )
@@ -557,101 +467,13 @@ class _Addition:
         return tuple(outcomes)
 
 
-def _grown_index(
-    index: Index, fresh: Sequence[str], folder: Path, config: cfg.ImagesConfig, cache: PhotoCache
-) -> Index:
-    """The index with more photos; a new photo gets the camera of the photos that it is grouped with.
-
-    Raises
-    ------
-    InputError
-        If photos of the scene are gone or were changed, or a new one does not fit the camera options.
-    """
-    before = {record.name: record for record in index.records}
-    gone = [name for name in before if not (folder / name).is_file()]
-    changed = [
-        name for name in before if name not in gone and cache.hash_of(folder / name) != before[name].sha256
-    ]
-    for names, what in ((gone, "are not there any more"), (changed, "were changed since")):
-        if names:
-            raise InputError(
-                f"{folder}: photos of the scene {what}: {first_few(names)}; put them back, or do everything "
-                "again with corrsfm run"
-            )
-    names = sorted([*before, *fresh])
-    infos = [cache.info_of(folder / name) for name in names]
-    proposed, groups = assign_cameras(
-        names, infos, mode=config.camera_mode, model=config.camera_model, params=config.camera_params
-    )
-    cameras = list(index.cameras)
-    camera_of_group = {
-        group: before[name].camera_id for name, group in zip(names, groups, strict=True) if name in before
-    }
-    for group, camera in enumerate(proposed):
-        if group not in camera_of_group:
-            camera_of_group[group] = len(cameras)
-            cameras.append(camera)
-    masks = find_masks(config.mask_dir, folder, names)
-    records = []
-    for name, group, info, mask in zip(names, groups, infos, masks, strict=True):
-        records.append(
-            before[name]
-            if name in before
-            else ImageRecord(
-                name=name,
-                camera_id=camera_of_group[group],
-                sha256=cache.hash_of(folder / name),
-                mask=mask,
-                mask_sha256=sha256_of(config.mask_dir / mask) if config.mask_dir and mask else None,
-                gps=info.gps,
-            )
-        )
-    for remark in name_remarks(fresh):
-        logger.warning("%s", remark)
-    for group_of_equals in duplicate_images(records):
-        if not set(fresh).isdisjoint(group_of_equals):
-            logger.warning("photos with the same content: %s", ", ".join(group_of_equals))
-    # In the order of the first photo of each, as listing the folder would number them.
-    order = list(dict.fromkeys(record.camera_id for record in records))
-    position = {old: number for number, old in enumerate(order)}
-    return Index(
-        records=tuple(
-            dataclasses.replace(record, camera_id=position[record.camera_id]) for record in records
-        ),
-        cameras=tuple(cameras[old] for old in order),
-    )
-
-
-def _cameras_of_new(workspace: Workspace, index: Index, new: Sequence[str]) -> dict[str, tuple[int, Camera]]:
-    """For each new photo the id of its camera in the database, and the camera to write under a new id.
-
-    A photo shares the camera of the photos that it is grouped with if all of them have one and the same in
-    the model. Otherwise it gets its own, for which their focal lengths are the guess if there is no other.
-    """
-    models = read_models(workspace.sparse)
-    with colmap_log(), pycolmap.Database.open(workspace.database) as database:
-        used = {camera.camera_id for camera in database.read_all_cameras()}
-    free = max({*used, *(i for model in models for i in model.cameras)}, default=0) + 1
-    records = {record.name: record for record in index.records}
-    own: dict[int, int] = {}
-    chosen = {}
-    for name in new:
-        group = records[name].camera_id
-        companions = [one.name for one in index.records if one.camera_id == group and one.name not in new]
-        shared = camera_in_model(models[0], companions)
-        if shared is not None:
-            chosen[name] = (shared, camera_from_pycolmap(models[0].cameras[shared]))
-            continue
-        camera, focal_px = index.cameras[group], focal_of_photos(models[0], companions)
-        if focal_px is not None and not camera.has_prior_focal_length:
-            camera = dataclasses.replace(with_focal_length(camera, focal_px), has_prior_focal_length=False)
-        # Photos of which none is known yet share what they are grouped by; others proved to differ.
-        number = own.get(group) if not companions else None
-        if number is None:
-            number, free = free, free + 1
-            own[group] = number
-        chosen[name] = (number, camera)
-    return chosen
+def _refinement(config: cfg.ReconstructionConfig, num_threads: int) -> pycolmap.BundleAdjustmentOptions:
+    """How a whole model is adjusted: what mapping left alone stays."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = config.refine_intrinsics
+    options.refine_principal_point = config.refine_principal_point
+    options.ceres.solver_options.num_threads = num_threads
+    return options
 
 
 def _restore_models(workspace: Workspace) -> None:

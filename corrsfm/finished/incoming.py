@@ -10,8 +10,10 @@ from corrsfm.errors import ImageError, InputError
 from corrsfm.files import sha256_of
 from corrsfm.images.listing import list_images
 from corrsfm.images.photos import read_image
+from corrsfm.workspace import Workspace
+from corrsfm.workspace.imported import imported_from
 
-__all__ = ["Incoming", "PhotoPaths", "find_photos", "name_in", "require_readable"]
+__all__ = ["Incoming", "PhotoPaths", "find_photos", "name_in", "refuse_imported", "require_readable"]
 
 PhotoPaths = Path | str | Sequence[Path | str]
 """Photos, and folders of photos."""
@@ -78,6 +80,21 @@ def name_in(file: Path, folder: Path) -> str:
     """Posix path of a file relative to a folder; empty if it lies elsewhere."""
     place, root = file.resolve(), folder.resolve()
     return place.relative_to(root).as_posix() if place.is_relative_to(root) else ""
+
+
+def refuse_imported(workspace: Workspace) -> None:
+    """Check that the features of the scene are ones that can be made of other photos.
+
+    Raises
+    ------
+    InputError
+        If they were imported.
+    """
+    if imported_from(workspace, "features") is not None:
+        raise InputError(
+            f"{workspace.root}: the features of this scene were imported, so corrsfm cannot make those of other "
+            f"photos; import a file that holds them too: {workspace.command_for('features')} --overwrite"
+        )
 
 
 def require_readable(photos: Sequence[Incoming]) -> None:

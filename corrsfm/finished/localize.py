@@ -21,13 +21,14 @@ from corrsfm.colmap.cameras import camera_from_pycolmap, mean_focal_px, with_foc
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import read_models
 from corrsfm.errors import InputError
-from corrsfm.features.sift import create_extractor
+from corrsfm.features import create_extractor
 from corrsfm.files import atomic_write_text
-from corrsfm.finished.incoming import PhotoPaths, find_photos, require_readable
+from corrsfm.finished.incoming import PhotoPaths, find_photos, refuse_imported, require_readable
 from corrsfm.geometry import camera_centre
 from corrsfm.images.cameras import PhotoInfo, assign_cameras
 from corrsfm.images.photos import read_image, read_photo_info
 from corrsfm.machine import count_threads, find_device, use_threads
+from corrsfm.matches.lightglue import LightGlueMatcher
 from corrsfm.matches.nearest import Matcher
 from corrsfm.pairs.strategies import pairs_of_new_photos
 from corrsfm.prune import build_pruner, make_correspondences
@@ -39,9 +40,10 @@ from corrsfm.reconstruction.resection import (
     focal_of_photos,
     resect,
 )
-from corrsfm.types import Camera, Features
+from corrsfm.types import Camera, Features, Matches
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES
+from corrsfm.workspace.imported import traits_of
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.store import ItemStore
 
@@ -192,6 +194,7 @@ def localize(
     """
     scene, run = Workspace(Path(workspace)), run or cfg.RunConfig()
     with scene.reading():
+        refuse_imported(scene)
         scene.require("models")
         find_device(run.device)
         found = find_photos(photos, None)
@@ -220,10 +223,12 @@ class _Locator:
         self._camera_model = camera_model or self._images.camera_model
         self._camera_params = camera_params
         self._run = run
-        self._extract = create_extractor(self._options("features", cfg.FeaturesConfig))
+        self._device = find_device(run.device)
+        self._extract = create_extractor(self._options("features", cfg.FeaturesConfig), self._device)
         self._prune = build_pruner(
             self._options("pruned matches", cfg.PruneConfig),
-            device=find_device(run.device),
+            traits=traits_of(workspace),
+            device=self._device,
             seed=run.seed,
             threads=count_threads(run.threads),
         )
@@ -266,11 +271,15 @@ class _Locator:
             inside = [name for name in pair if name not in own]
             if len(inside) == 1:
                 partners[pair[0] if pair[1] == inside[0] else pair[1]].append(inside[0])
-        matcher = Matcher(lambda name: load(name).descriptors, device=find_device(self._run.device))
+        match: Callable[[str, str], Matches]
+        if self._options("matches", cfg.MatchesConfig).matcher is cfg.Matcher.LIGHTGLUE:
+            match = LightGlueMatcher(load, traits_of(self._workspace).features, device=self._device).match
+        else:
+            match = Matcher(lambda name: load(name).descriptors, device=self._device).match
         located = []
         for key, (name, path) in zip(keys, photos, strict=True):
             info = read_photo_info(path)
-            matches = self._matches(key, partners[key], matcher, load, self._proposed(info))
+            matches = self._matches(key, partners[key], match, load, self._proposed(info))
             located.append(self._best(name, own[key], info, matches))
         return located
 
@@ -278,13 +287,13 @@ class _Locator:
         self,
         key: str,
         partners: Sequence[str],
-        matcher: Matcher,
+        match: Callable[[str, str], Matches],
         load: Callable[[str], Features],
         camera: Camera,
     ) -> dict[str, NDArray[np.int32]]:
         """Photo of the scene → kept matches, the keypoints of the new photo first."""
         cameras = {record.name: self._index.camera_of(record) for record in self._index.records}
-        putative = [matcher.match(key, name) for name in partners]
+        putative = [match(key, name) for name in partners]
         results = self._prune(
             [
                 make_correspondences(load(key), load(name), matched, camera, cameras[name], name)

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors
-from corrsfm.reconstruction.calibration import adjust, refine_intrinsics
+from corrsfm.reconstruction.cache import load_cache
+from corrsfm.reconstruction.calibration import adjust, refine
 from corrsfm.reconstruction.resection import Landmarks, Resection, find_sightings, resect
 from corrsfm.types import Pair
 
@@ -54,8 +54,7 @@ def grow(
     verified: Mapping[Pair, NDArray[np.int32]],
     *,
     known_focal: Mapping[str, bool],
-    refine: bool = False,
-    refine_principal_point: bool = False,
+    refinement: pycolmap.BundleAdjustmentOptions | None = None,
     seed: int = 0,
     num_threads: int = 1,
 ) -> Growth:
@@ -74,10 +73,8 @@ def grow(
         Verified matches, as keypoint indices of the database.
     known_focal : mapping of str to bool
         Photo → whether its focal length is known and stays.
-    refine : bool
-        At the end adjust the whole model: everything may move.
-    refine_principal_point : bool
-        When everything may.
+    refinement : pycolmap.BundleAdjustmentOptions, optional
+        How to adjust the whole model at the end, so that everything may move.
     seed, num_threads : int
 
     Returns
@@ -96,9 +93,8 @@ def grow(
     num_points = grown.num_points3D()
     registered: dict[str, Resection] = {}
     failed: dict[str, Resection] = {}
-    with colmap_log(), database_errors(database):
-        with pycolmap.Database.open(database) as tables:
-            cache = pycolmap.DatabaseCache.create(tables, pycolmap.DatabaseCacheOptions())
+    cache = load_cache(database, model)
+    with colmap_log():
         mapper = pycolmap.IncrementalMapper(cache)
         mapper.begin_reconstruction(grown)
         try:
@@ -115,8 +111,8 @@ def grow(
                 _complete(grown, mapper, registered, seed)
         finally:
             mapper.end_reconstruction(False)
-    if refine and registered:
-        refine_intrinsics(grown, refine_principal_point=refine_principal_point, num_threads=num_threads)
+    if refinement is not None and registered:
+        refine(grown, refinement)
     grown.update_point_3d_errors()
     return Growth(
         model=grown,

@@ -22,6 +22,7 @@ from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import database_errors
 from corrsfm.reconstruction.best_model import SceneEvidence
+from corrsfm.reconstruction.cache import load_cache
 from corrsfm.reconstruction.calibration import has_possible_cameras, refine
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.predicted import nearest_descriptors
@@ -353,9 +354,8 @@ def _merged(
         pycolmap.Sim3d(a_from_b.scale, pycolmap.Rotation3d(a_from_b.rotation), a_from_b.translation)
     )
     used = {image.camera_id for image in in_a.values()}
-    with colmap_log(), database_errors(database):
-        with pycolmap.Database.open(database) as tables:
-            cache = pycolmap.DatabaseCache.create(tables, pycolmap.DatabaseCacheOptions())
+    cache = load_cache(database, a, b)
+    with colmap_log():
         mapper = pycolmap.IncrementalMapper(cache)
         mapper.begin_reconstruction(merged)
         new = sorted(in_b.keys() - in_a.keys())

@@ -247,11 +247,12 @@ def test_what_cannot_be_added_is_refused_and_nothing_changes(scene: SceneToGrow,
     refused(scene, scene.new, InputError, "is not there; mount it")
 
 
-def test_a_changed_photo_of_the_scene_stops_the_addition(scene: SceneToGrow) -> None:
+def test_a_changed_or_lost_photo_of_the_scene_stops_the_addition(scene: SceneToGrow) -> None:
     known = sorted(scene.photos.iterdir())[0]
     shutil.copy2(scene.new / scene.new_names[0], known)
-    with pytest.raises(InputError, match=f"were changed since: {known.name}"):
-        add_photos(scene.workspace, scene.new / scene.new_names[1], run=RUN)
+    refused(scene, scene.new / scene.new_names[1], InputError, f"were changed since: {known.name}")
+    known.unlink()
+    refused(scene, scene.new / scene.new_names[1], InputError, f"are not there any more: {known.name}")
 
 
 def test_an_unfinished_or_locked_workspace_is_refused(scene: SceneToGrow, tmp_path: Path) -> None:

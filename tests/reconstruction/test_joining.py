@@ -7,8 +7,10 @@ import pycolmap
 import pytest
 from two_parts import TwoParts, make_two_parts
 
+from corrsfm.config import ReconstructionConfig
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
 from corrsfm.reconstruction.joining import FEWEST_POINTS, join_models
+from corrsfm.reconstruction.mapper import reconstruct
 from corrsfm.reconstruction.similarity import Observed, find_similarity, fit_similarity
 from corrsfm.reconstruction.views import views_of
 
@@ -106,6 +108,21 @@ def test_models_that_share_photos_are_joined_by_them(tmp_path: Path) -> None:
     models, (attempt,) = join_models([first, second], parts.database, parts.evidence)
     assert attempt.is_joined and len(models) == 1
     assert relative_pose_differences_deg(views_of(models[0]), views_of(parts.truth)).max() < 0.6
+
+
+def test_the_mapper_hands_its_models_on_to_be_joined(tmp_path: Path) -> None:
+    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+
+    def join(models: list[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+        return join_models(models, parts.database, parts.evidence)[0]
+
+    config = ReconstructionConfig(refine_intrinsics=False)
+    apart = reconstruct(parts.database, None, tmp_path / "apart", config=config, num_threads=1)
+    joined = reconstruct(parts.database, None, tmp_path / "joined", config=config, num_threads=1, join=join)
+    assert [model.num_images for model in apart] == [5, 5]
+    assert [model.num_images for model in joined] == [10]
+    views = views_of(pycolmap.Reconstruction(tmp_path / "joined" / "0"))
+    assert relative_pose_differences_deg(views, views_of(parts.truth)).max() < 0.6
 
 
 def observed(points: np.ndarray, seen_from: np.ndarray) -> Observed:
