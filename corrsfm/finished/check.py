@@ -188,7 +188,7 @@ def check_workspace(workspace: Path | str) -> WorkspaceCheck:
     return WorkspaceCheck(
         num_photos=len(report.image_names),
         num_registered=report.num_registered,
-        grade=report.evidence["verdict"]["grade"] if report.verdict else None,
+        grade=report.evidence.get("verdict", {}).get("grade"),
         verdict=report.verdict,
         photos=held,
         parts=report.components,

@@ -92,8 +92,8 @@ def refuse_imported(workspace: Workspace) -> None:
     """
     if imported_from(workspace, "features") is not None:
         raise InputError(
-            f"{workspace.root}: the features of this scene were imported, so corrsfm cannot make those of other "
-            f"photos; import a file that holds them too: {workspace.command_for('features')} --overwrite"
+            f"{workspace.root}: the features of this scene were imported, and corrsfm cannot make those of "
+            f"other photos; import a file that holds them too: {workspace.command_for('features')} --overwrite"
         )
 
 
