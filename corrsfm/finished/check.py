@@ -331,6 +331,7 @@ def _parts(report: SceneReport, bridges: Sequence[Bridge], workspace: Workspace)
                 step = command_again(workspace, "pruned matches", "--min-num-inliers", fewest)
             else:
                 step = _add(workspace, f"between {best.name0} and {best.name1}")
+        text += _why_not_joined(report, set(part))
         findings.append(SceneFinding(kind="parts", text=text, photos=part, next_step=step))
     return findings
 
@@ -346,9 +347,20 @@ def _models(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:
             text = (
                 f"model {number} holds {len(names)} photos that model 0 does not, though pairs connect them"
             )
+            text += _why_not_joined(report, set(names))
             step = _add(workspace, f"that show what both {names[0]} and model 0 see")
             findings.append(SceneFinding(kind="models", text=text, photos=names, next_step=step))
     return findings
+
+
+def _why_not_joined(report: SceneReport, photos: set[str]) -> str:
+    """What the attempt to join a model of these photos with the first one said, if there was one."""
+    first = set(report.models[0].image_names) if report.models else set()
+    for attempt in report.evidence.get("joinings", ()):
+        names0, names1 = set(attempt["photos0"]), set(attempt["photos1"])
+        if not attempt["is_joined"] and names0 <= first and not names1.isdisjoint(photos):
+            return f"; not joined: {attempt['reason']}"
+    return ""
 
 
 def _missing(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:

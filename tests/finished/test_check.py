@@ -111,8 +111,11 @@ def test_parts_come_with_the_pairs_that_nearly_bridge_them(
 def test_a_gap_without_matches_asks_for_photos(scene: FinishedScene, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, c, d, e = scene.names
     pairs = [pair(a, b, 100), pair(b, c, 100), pair(d, e, 80), pair(c, d, 0, 4)]
-    result = check_of(scene, report_of(pairs, model_of(a, b, c), model_of(d, e)), monkeypatch)
+    attempt = {"photos0": [a, b, c], "photos1": [d, e], "is_joined": False, "reason": "3 points agree"}
+    report = report_of(pairs, model_of(a, b, c), model_of(d, e), evidence={"joinings": [attempt]})
+    result = check_of(scene, report, monkeypatch)
     (finding,) = [one for one in result.findings if one.kind == "parts"]
+    assert finding.text.endswith("with 4 kept matches; not joined: 3 points agree")
     assert finding.next_step == (
         f"take photos between {c} and {d}, then: corrsfm add {scene.workspace} NEWPHOTOS"
     )
