@@ -239,3 +239,5 @@ def load_toml(path: Path, what: str) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read ({error.strerror}); expected {what} in TOML") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path}: its values are nested too deep; expected {what}") from error

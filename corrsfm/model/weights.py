@@ -361,8 +361,24 @@ def _fill(network: nn.Module, state: Mapping[str, Any], complaint: str) -> None:
             problems.append(f"{name} is not a tensor")
         elif shape != tuple(own[name].shape):
             problems.append(f"{name} has shape {shape}, expected {tuple(own[name].shape)}")
+        elif not _holds_numbers_like(state[name], own[name]):
+            problems.append(f"{name} is not a plain tensor of {_kind(own[name])} numbers")
         elif not state[name].isfinite().all():
             problems.append(f"{name} holds values that are not finite")
     if problems:
         raise CheckpointError(f"{complaint}: " + "; ".join(problems))
     network.load_state_dict(dict(state), strict=True)
+
+
+def _holds_numbers_like(values: Tensor, expected: Tensor) -> bool:
+    """Whether values are there, dense, and of the kind that the network counts with."""
+    return (
+        values.layout is torch.strided
+        and values.device.type != "meta"
+        and not values.is_quantized
+        and _kind(values) == _kind(expected)
+    )
+
+
+def _kind(values: Tensor) -> str:
+    return "complex" if values.is_complex() else "real" if values.is_floating_point() else "whole"

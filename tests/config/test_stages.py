@@ -119,3 +119,9 @@ def test_hash_of_nested_records_is_by_value() -> None:
     same = Camera(model="PINHOLE", width=4, height=3, params=(1.0, 1.0, 2.0, 1.5))
     other = dataclasses.replace(camera, width=5)
     assert cfg.config_hash([camera]) == cfg.config_hash([same]) != cfg.config_hash([other])
+
+
+def test_values_nested_without_end_are_an_error(tmp_path: Path) -> None:
+    (tmp_path / "deep.toml").write_text("a=" + 100_000 * "[")
+    with pytest.raises(ConfigError, match=r"deep\.toml: its values are nested too deep"):
+        cfg.load_pipeline(tmp_path / "deep.toml")

@@ -103,6 +103,26 @@ def test_missing_and_unexpected_keys_are_listed(checkpoint):
     assert "1 unexpected keys: head.surprise" in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "change",
+    [
+        torch.Tensor.to_sparse,
+        lambda values: values.to(torch.complex64),
+        lambda values: values.to(torch.int8),
+        lambda values: values.to("meta"),
+        lambda values: torch.quantize_per_tensor(values.float(), 0.1, 0, torch.qint8),
+    ],
+    ids=["sparse", "complex", "whole", "absent", "quantised"],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_weights_that_are_no_plain_numbers_are_refused(checkpoint, change):
+    content = torch.load(checkpoint, weights_only=True)
+    content["state_dict"]["head.linear1.weight"] = change(content["state_dict"]["head.linear1.weight"])
+    torch.save(content, checkpoint)
+    with pytest.raises(CheckpointError, match="head.linear1.weight is not a plain tensor of real numbers"):
+        load_network(checkpoint)
+
+
 def test_published_format_with_other_keys_is_refused(tmp_path):
     path = tmp_path / "other.pth"
     torch.save({"state_dict": {"layer.weight": torch.zeros(2)}}, path)
