@@ -408,7 +408,7 @@ class _Addition:
         placed: Mapping[str, tuple[int, Resection]],
         last: Mapping[str, Resection],
     ) -> None:
-        """Write the models, what became of each photo, and the verdict on the first model as it is now."""
+        """Write the models, what became of each photo, and the verdict."""
         workspace = self._workspace
         held = {
             image.name: number
@@ -429,18 +429,24 @@ class _Addition:
                 (temporary / str(number)).mkdir(parents=True)
                 model.write_binary(temporary / str(number))
         if workspace.evidence.exists():
-            with ItemStore(workspace.features, FEATURES).reader() as load:
-                evidence = SceneEvidence(
-                    read_index(workspace).names,
-                    read_verified_matches(workspace.database),
-                    load,
-                    seed=self._run.seed,
-                )
-                selection = judge_as_it_is(
-                    models[0], evidence, name=_ORIGIN, reason="photos were added to a finished model"
-                )
-                atomic_write_json(workspace.evidence, record_of(selection, evidence))
-            logger.info("verdict: %s", selection.verdict)
+            self._judge(models[0])
+
+    def _judge(self, model: pycolmap.Reconstruction) -> None:
+        """Write the verdict on the first model as it is now."""
+        workspace = self._workspace
+        with ItemStore(workspace.features, FEATURES).reader() as load:
+            names, verified = read_index(workspace).names, read_verified_matches(workspace.database)
+            evidence = SceneEvidence(names, verified, load, seed=self._run.seed)
+            reason = "photos were added to a finished model"
+            selection = judge_as_it_is(model, evidence, name=_ORIGIN, reason=reason)
+            record = record_of(selection, evidence)
+        try:
+            before = json.loads(workspace.evidence.read_text(encoding="utf-8"))
+            record |= {"joinings": before["joinings"]}
+        except (ValueError, KeyError, TypeError):
+            logger.debug("%s: says nothing of models that were joined", workspace.evidence)
+        atomic_write_json(workspace.evidence, record)
+        logger.info("verdict: %s", selection.verdict)
 
     def _outcomes(self, summary: SceneReport) -> tuple[AddedPhoto, ...]:
         """What became of each photo, with a reason and a next step where it joined no model."""

@@ -8,7 +8,7 @@ from corrsfm.report.missing import MissingPhoto, MissingReason
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 
-__all__ = ["command_again", "next_step"]
+__all__ = ["command_again", "more_photos_to_add", "more_photos_to_map", "next_step"]
 
 
 def command_again(workspace: Workspace, stage: str, *flags: str) -> str:
@@ -43,5 +43,17 @@ def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
             return command_again(workspace, "pruned matches", "--min-num-inliers", "10")
         case MissingReason.NOT_MAPPED:
             return workspace.command_for("models")
-    root = shlex.quote(str(workspace.root))
-    return f"take photos between this one and those of the model, then: corrsfm add {root} NEWPHOTOS"
+        case MissingReason.OTHER_MODEL | MissingReason.OTHER_COMPONENT:
+            return more_photos_to_map(workspace, "between this one and those of the model")
+    return more_photos_to_add(workspace, "next to this one")
+
+
+def more_photos_to_add(workspace: Workspace, where: str) -> str:
+    """Photos that make a model firmer, which stays where it is."""
+    return f"take photos {where}, then: corrsfm add {shlex.quote(str(workspace.root))} NEWPHOTOS"
+
+
+def more_photos_to_map(workspace: Workspace, where: str) -> str:
+    """Photos that connect parts of a scene: all must be mapped again."""
+    folder = shlex.quote(str(workspace.images_dir))
+    return f"take photos {where}, put them into {folder}, then: {command_again(workspace, 'images')}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shlex
 import shutil
 import tempfile
 from collections import Counter, defaultdict
@@ -17,7 +16,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.errors import first_few
-from corrsfm.finished.advice import command_again, next_step
+from corrsfm.finished.advice import command_again, more_photos_to_add, more_photos_to_map, next_step
 from corrsfm.reconstruction.explained import CONTRADICTED_BELOW
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.stage import summarise
@@ -330,7 +329,7 @@ def _parts(report: SceneReport, bridges: Sequence[Bridge], workspace: Workspace)
                 fewest = str(max(_FEWEST_TO_LOWER_FOR, best.num_kept * 2 // 3))
                 step = command_again(workspace, "pruned matches", "--min-num-inliers", fewest)
             else:
-                step = _add(workspace, f"between {best.name0} and {best.name1}")
+                step = more_photos_to_map(workspace, f"between {best.name0} and {best.name1}")
         text += _why_not_joined(report, set(part))
         findings.append(SceneFinding(kind="parts", text=text, photos=part, next_step=step))
     return findings
@@ -348,7 +347,7 @@ def _models(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:
                 f"model {number} holds {len(names)} photos that model 0 does not, though pairs connect them"
             )
             text += _why_not_joined(report, set(names))
-            step = _add(workspace, f"that show what both {names[0]} and model 0 see")
+            step = more_photos_to_map(workspace, f"that show what both {names[0]} and model 0 see")
             findings.append(SceneFinding(kind="models", text=text, photos=names, next_step=step))
     return findings
 
@@ -393,10 +392,6 @@ def _weak(held: Sequence[HeldPhoto], workspace: Workspace) -> list[SceneFinding]
             text=f"{len(weak)} registered photos are weakly held (half of all see {usual} points or more): "
             + first_few(f"{photo.name}: {photo.weakness}" for photo in weak),
             photos=tuple(photo.name for photo in weak),
-            next_step=_add(workspace, f"next to {first_few(photo.name for photo in weak)}"),
+            next_step=more_photos_to_add(workspace, f"next to {first_few(photo.name for photo in weak)}"),
         )
     ]
-
-
-def _add(workspace: Workspace, where: str) -> str:
-    return f"take photos {where}, then: corrsfm add {shlex.quote(str(workspace.root))} NEWPHOTOS"

@@ -217,8 +217,7 @@ class _Choice:
             )
             self.record = record_of(selection, self._evidence)
             logger.info("verdict: %s", selection.verdict)
-        if self.record is not None:
-            self.record["joinings"] = [attempt.to_dict() for attempt in attempts]
+        self.record = {**(self.record or {}), "joinings": [attempt.to_dict() for attempt in attempts]}
         return left
 
     def _cameras_on_trial(self) -> StartingCameras | None:

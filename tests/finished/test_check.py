@@ -116,9 +116,10 @@ def test_a_gap_without_matches_asks_for_photos(scene: FinishedScene, monkeypatch
     result = check_of(scene, report, monkeypatch)
     (finding,) = [one for one in result.findings if one.kind == "parts"]
     assert finding.text.endswith("with 4 kept matches; not joined: 3 points agree")
-    assert finding.next_step == (
-        f"take photos between {c} and {d}, then: corrsfm add {scene.workspace} NEWPHOTOS"
+    assert finding.next_step.startswith(
+        f"take photos between {c} and {d}, put them into {scene.photos}, then: "
     )
+    assert "corrsfm extract" in finding.next_step and "corrsfm reconstruct" in finding.next_step
 
 
 def test_a_wrong_model_comes_first_and_ends_with_a_code(scene: FinishedScene) -> None:
