@@ -153,8 +153,8 @@ def depends_on_seed(config: PruneConfig) -> bool:
     return config.method in (PruneMethod.LORANSAC, PruneMethod.MAGSAC)
 
 
-def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.SIFT) -> str | None:
-    """SHA-256 of the checkpoint that a config's method uses for features of a kind; None if it uses none.
+def checkpoint_sha256(config: PruneConfig) -> str | None:
+    """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.S
         return None
     from corrsfm.model import weights
 
-    return weights.checkpoint_sha256(config.model or weights.default_checkpoint(features))
+    return weights.checkpoint_sha256(config.model)
 
 
 def _load_network_pruner(
@@ -175,10 +175,8 @@ def _load_network_pruner(
     from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    features = FeatureKind.SIFT if traits is None else traits.features
-    name = config.model or weights.default_checkpoint(features)
     pruner = Pruner.load(
-        name,
+        config.model,
         device=device,
         operating_point=config.operating_point,
         max_candidates=config.max_candidates,
@@ -188,14 +186,19 @@ def _load_network_pruner(
     )
     if traits is None:
         return pruner
+    name = config.model or weights.DEFAULT_CHECKPOINT
     missing = missing_channels(
         pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
     )
     if missing:
         advice = _WITHOUT_RATIOS
         if traits.has_ratios:
-            fits = weights.default_checkpoint(features)
-            advice = (f"try --model {fits}, or " if fits != name else "try ") + "--method loransac"
+            fitting = [
+                row.name
+                for row in weights.REGISTRY.values()
+                if not missing_channels(row.config.side_channels, has_shapes=False, has_ratios=True)
+            ]
+            advice = f"use --method loransac, or --model {' or '.join(fitting)}"
         raise CheckpointError(
             f"{name}: this network reads {missing}, which {traits.features} features and their matches here "
             f"lack; {advice}"
