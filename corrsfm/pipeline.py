@@ -33,7 +33,7 @@ from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
-from corrsfm.workspace.imported import refuse_foreign_files, traits_of, traits_to_come
+from corrsfm.workspace.imported import refuse_foreign_files, traits_to_come
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome
 from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, keep_warnings
@@ -124,7 +124,7 @@ def _run_record(workspace: Workspace, config: cfg.PipelineConfig) -> dict[str, A
         "platform": platform.platform(),
         "seed": config.run.seed,
         "config": cfg.to_dict(config),
-        "checkpoint_sha256": checkpoint_sha256(config.prune, traits_of(workspace).features),
+        "checkpoint_sha256": checkpoint_sha256(config.prune),
         "images_dir": str(workspace.images_dir),
         "images_sha256": {record.name: record.sha256 for record in read_index(workspace).records},
         "seconds": {stage: record.seconds for stage, record in records.items() if record is not None},

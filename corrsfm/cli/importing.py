@@ -64,6 +64,7 @@ def import_(
     command = ["corrsfm", "run", str(images_dir), str(workspace_dir)]
     if result.num_pairs:
         click.echo(f"{result.num_matches:,} matches of {result.num_pairs} pairs")
-        # Without ratios of descriptor distances the bundled networks cannot tell.
+    if result.num_pairs or not result.has_shapes:
+        # The network that is loaded by default reads ratios, scale and orientation.
         command += ["--method", "loransac"]
     click.echo(f"next: {shlex.join(command)}")

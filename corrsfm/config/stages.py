@@ -264,14 +264,16 @@ class PruneConfig:
         "bundled one, all others with a network of yours (--model)",
     )
     model: Path | None = option(
-        None, "Network checkpoint; if not given the bundled one for the features", used_with=_NETWORK
+        None,
+        "Network checkpoint, or name of a bundled one; small-mutual, which is for SIFT, if not given",
+        used_with=_NETWORK,
     )
     operating_point: OperatingPoint = option(
         OperatingPoint.SFM,
         "sfm keeps what mapping can use; pose is strict, for two-view poses",
         used_with=_NETWORK,
     )
-    # With ALIKED every ratio up to 0.95 lost poses against none, see results/aliked_val_pose.json.
+    # With ALIKED every ratio up to 0.95 lost poses against none, see results/pose_val_aliked.json.
     max_ratio: float | None = option(
         None,
         "Largest descriptor distance ratio of the ratio test; if not given 0.8 for SIFT, and mutual matches "

@@ -93,7 +93,8 @@ def refuse_imported(workspace: Workspace) -> None:
     if imported_from(workspace, "features") is not None:
         raise InputError(
             f"{workspace.root}: the features of this scene were imported, and corrsfm cannot make those of "
-            f"other photos; import a file that holds them too: {workspace.command_for('features')} --overwrite"
+            "other photos; import a file that holds them too: "
+            f"{workspace.command_for('features')} --overwrite"
         )
 
 

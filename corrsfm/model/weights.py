@@ -26,7 +26,7 @@ from typing import Any, Literal, overload
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import FeatureKind, NetworkUsage, from_dict, to_dict
+from corrsfm.config import NetworkUsage, from_dict, to_dict
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
@@ -48,7 +48,6 @@ __all__ = [
     "BundledCheckpoint",
     "build_network",
     "checkpoint_sha256",
-    "default_checkpoint",
     "load_network",
     "read_provenance",
     "save_network",
@@ -105,17 +104,30 @@ REGISTRY: dict[str, BundledCheckpoint] = {
             training_data="5,873 pairs of 54 photo scenes with COLMAP poses; the model card names them",
             score="AUC@5° 75.0 against 69.2 of ratio + mutual, 240 validation pairs, 4,096 keypoints",
         ),
+        BundledCheckpoint(
+            name="small-aliked",
+            file="small-aliked.pt",
+            sha256="c07c5a74c003691b98d90089bb75ef07c8b0c8ed2b99519e773ceae17859ca2e",
+            config=NetworkConfig(
+                channels=32,
+                clusters=48,
+                neighbors=(6, 3),
+                heads=2,
+                mlp_ratio=2,
+                motion_stacking=1,
+                oa_filters=1,
+                side_channels=2,
+            ),
+            licence="Apache-2.0",
+            training_data="1,882 pairs of 54 photo scenes with COLMAP poses; the model card names them",
+            score="AUC@5° 50.2 against 51.3 of mutual and 44.3 of ratio + mutual, 135 validation pairs",
+        ),
     )
 }
 """Bundled checkpoints by name."""
 
 DEFAULT_CHECKPOINT = "small-mutual"
 """Name of the checkpoint that is loaded by default."""
-
-
-def default_checkpoint(features: FeatureKind) -> str:
-    """Name of the bundled checkpoint for matches of features of a kind."""
-    return DEFAULT_CHECKPOINT
 
 
 def build_network(config: NetworkConfig | RivalConfig) -> CorrAdaptor | Rival:

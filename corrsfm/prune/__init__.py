@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from corrsfm.config import FeatureKind, MatchTraits, PruneConfig, PruneMethod
@@ -155,8 +154,8 @@ def depends_on_seed(config: PruneConfig) -> bool:
     return config.method in (PruneMethod.LORANSAC, PruneMethod.MAGSAC)
 
 
-def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.SIFT) -> str | None:
-    """SHA-256 of the checkpoint that a config's method uses for features of a kind; None if it uses none.
+def checkpoint_sha256(config: PruneConfig) -> str | None:
+    """SHA-256 of the checkpoint that a config's method uses; None if it uses none.
 
     Raises
     ------
@@ -169,21 +168,17 @@ def checkpoint_sha256(config: PruneConfig, features: FeatureKind = FeatureKind.S
         return None
     from corrsfm.model import weights
 
-    return weights.checkpoint_sha256(_checkpoint(config, features))
+    _require_weights(config)
+    return weights.checkpoint_sha256(config.model)
 
 
-def _checkpoint(config: PruneConfig, features: FeatureKind) -> Path | str:
-    """The checkpoint that a config's method uses: its own, or the bundled one for features of a kind."""
-    from corrsfm.model import weights
-
-    if config.model is not None:
-        return config.model
-    if config.method.architecture != PruneMethod.CORRADAPTOR:
+def _require_weights(config: PruneConfig) -> None:
+    """Check that a config names weights where none come with the package."""
+    if config.model is None and config.method.architecture != PruneMethod.CORRADAPTOR:
         raise ConfigError(
             f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint with "
             "--model FILE, published or trained with `corrsfm train`"
         )
-    return weights.default_checkpoint(features)
 
 
 def _load_network_pruner(
@@ -193,11 +188,10 @@ def _load_network_pruner(
     from corrsfm.model import weights
     from corrsfm.prune.learned import Pruner
 
-    features = FeatureKind.SIFT if traits is None else traits.features
-    name = _checkpoint(config, features)
+    _require_weights(config)
     assert config.method.architecture is not None
     pruner = Pruner.load(
-        name,
+        config.model,
         config.method.architecture,
         device=device,
         operating_point=config.operating_point,
@@ -208,15 +202,21 @@ def _load_network_pruner(
     )
     if traits is None:
         return pruner
+    name = config.model or weights.DEFAULT_CHECKPOINT
     missing = missing_channels(
         pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
     )
     if missing:
         advice = _WITHOUT_RATIOS
         if traits.has_ratios:
-            fits = weights.default_checkpoint(features)
-            has_other = config.method.architecture == PruneMethod.CORRADAPTOR and fits != name
-            advice = (f"try --model {fits}, or " if has_other else "try ") + "--method loransac"
+            fitting = [
+                row.name
+                for row in weights.REGISTRY.values()
+                if not missing_channels(row.config.side_channels, has_shapes=False, has_ratios=True)
+            ]
+            advice = "use --method loransac"
+            if config.method.architecture == PruneMethod.CORRADAPTOR:
+                advice += f", or --model {' or '.join(fitting)}"
         raise CheckpointError(
             f"{name}: this network reads {missing}, which {traits.features} features and their matches here "
             f"lack; {advice}"
