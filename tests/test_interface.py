@@ -81,7 +81,7 @@ def test_a_workspace_is_read_photo_by_photo(repository: Path) -> None:
     matches, kept = scene.matches((name0, name1)), scene.kept((name0, name1))
     assert 0 < len(kept.indices) < len(matches) <= len(scene.features(name0)) == 200
     assert scene.camera(name1).model == "SIMPLE_RADIAL"
-    with pytest.raises(WorkspaceError, match="no models yet; run: corrsfm reconstruct"):
+    with pytest.raises(WorkspaceError, match="mapping gave no model; why: corrsfm report"):
         scene.models()
 
 
