@@ -139,7 +139,8 @@ def test_listed_tensors_are_recognised(shared_dir, architecture, tmp_path):
     state = {}
     for line in (shared_dir / f"parity/rivals/{architecture}_state_dict.txt").read_text().splitlines():
         name, text = line.split()
-        state[name] = torch.zeros([] if text == "scalar" else [int(size) for size in text.split("x")])
+        shape = [] if text == "scalar" else [int(size) for size in text.split("x")]
+        state[name] = torch.zeros(shape, dtype=torch.int64 if "num_batches" in name else torch.float32)
     path = tmp_path / "model_best.pth"
     torch.save(state, path)
     assert load_network(path).config == RivalConfig(architecture=architecture)
