@@ -48,6 +48,7 @@ from corrsfm.machine import count_threads, find_device
 from corrsfm.matches.stage import match_pairs
 from corrsfm.pairs.stage import fingerprint_of as pairs_fingerprint
 from corrsfm.pairs.strategies import pairs_of_new_photos
+from corrsfm.pipeline import check_options
 from corrsfm.prune.stage import prune_matches
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
 from corrsfm.reconstruction.growth import grow
@@ -184,6 +185,7 @@ def add_photos(
         pending = dataclasses.replace(pending, photos=wanted, refine=refine or pending.refine)
         addition = _Addition(scene, pending, run)
         # Whatever does not fit is refused before anything is changed.
+        addition.check_options()
         addition.grown_index({photo.name: photo.path for photo in incoming})
         atomic_write_json(scene.adding, dataclasses.asdict(pending))
         copy_photos(incoming, scene.images_dir)
@@ -211,6 +213,16 @@ class _Addition:
 
     def _options(self, stage: str, options: type[T]) -> T:
         return cfg.from_dict(options, self._recorded[stage], f"{self._workspace.adding}: {stage}")
+
+    def check_options(self) -> None:
+        """Check that the networks of the scene are here; raises as `corrsfm.pipeline.check_options`."""
+        check_options(
+            self._run,
+            self._options("pruned matches", cfg.PruneConfig),
+            features=self._options("features", cfg.FeaturesConfig),
+            matches=self._options("matches", cfg.MatchesConfig),
+            workspace_dir=self._workspace.root,
+        )
 
     def finish(self, already: tuple[str, ...]) -> AddResult:
         """Do what is left to do."""
