@@ -126,7 +126,7 @@ def test_a_later_run_keeps_the_addition_and_says_so(
     with caplog.at_level(logging.INFO, "corrsfm"):
         report = run_scene(grown.photos, grown.workspace, CONFIG)
     assert contents(grown.workspace / "sparse") == before
-    assert "2 photos were added to them without mapping again; kept" in caplog.text
+    assert "photos added to them without mapping again are kept: 2" in caplog.text
     assert report.num_registered == 7
 
 
