@@ -177,7 +177,7 @@ def _require_weights(config: PruneConfig) -> None:
     if config.model is None and config.method.architecture != PruneMethod.CORRADAPTOR:
         raise ConfigError(
             f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint, "
-            f"published or trained with `corrsfm train`, with --model FILE ({config.method}:FILE in a list of "
+            f"published or trained with `corrsfm train`, by --model FILE ({config.method}:FILE in a list of "
             "methods)"
         )
 
