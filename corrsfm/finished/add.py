@@ -63,7 +63,7 @@ from corrsfm.reconstruction.resection import Resection
 from corrsfm.reconstruction.stage import fingerprint_of as models_fingerprint
 from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
-from corrsfm.types import Pair, PairList
+from corrsfm.types import Camera, Pair, PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, PRUNED
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_index, write_pairs
@@ -364,10 +364,12 @@ class _Addition:
             ItemStore(workspace.features, FEATURES).reader() as read_features,
             ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
         ):
+            cameras = cameras_of_new(workspace, index, self._new)
+            self._remark_on(cameras)
             add_to_database(
                 workspace.database,
                 images=[record for record in index.records if record.name in fresh],
-                cameras=cameras_of_new(workspace, index, self._new),
+                cameras=cameras,
                 features=read_features,
                 kept=((*pair, read_pruned(pair).indices) for pair in of_new),
                 config=config,
@@ -384,6 +386,18 @@ class _Addition:
         inputs = {"pruned matches": workspace.require("pruned matches").fingerprint}
         finish(workspace, outcome, fingerprint, config, inputs=inputs)
         return outcome
+
+    def _remark_on(self, cameras: Mapping[str, tuple[int, Camera]]) -> None:
+        """Put into `cameras.json` who of the new photos shares a camera of the model."""
+        path, model = self._workspace.cameras_json, read_models(self._workspace.sparse)[0]
+        remarks = json.loads(path.read_text(encoding="utf-8"))["remarks"] if path.is_file() else []
+        shared = [name for name, (number, _) in cameras.items() if number in model.cameras]
+        own = [name for name in cameras if name not in shared]
+        for names, camera in ((shared, "the camera of photos like them"), (own, "cameras of their own")):
+            remark = f"added with {camera}: {first_few(names)}"
+            if names and remark not in remarks:
+                remarks.append(remark)
+        atomic_write_json(path, {"remarks": remarks})
 
     def _models(self) -> int:
         """Put the new photos into the models, the first one first; the number of new points."""

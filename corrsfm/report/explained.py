@@ -113,9 +113,11 @@ def photos_to_show(
 def _summary(pairs: Sequence[Record], contradicted: Sequence[Record]) -> str:
     num_verified = sum(pair["num_verified"] for pair in pairs)
     num_explained = sum(pair["num_explained"] for pair in pairs)
+    # Rounded down, as in the verdict.
+    percent = 1000 * num_explained // num_verified / 10
     text = (
         f"The model's cameras agree with {num_explained:,} of {num_verified:,} verified matches "
-        f"({100 * num_explained / num_verified:.1f} %). "
+        f"({percent:.1f} %). "
     )
     if not contradicted:
         return f"<p>{text}No pair contradicts it.</p>"
@@ -276,7 +278,7 @@ def _listed(contradicted: Sequence[Record]) -> str:
         f"<td>{pair['num_verified']:,}</td><td>{pair['num_explained']:,}</td></tr>"
         for pair in contradicted[:_LISTED_PAIRS]
     )
-    count = f"All {len(contradicted):,} contradicted pairs"
+    count = f"Contradicted pairs: {len(contradicted):,}"
     if len(contradicted) > _LISTED_PAIRS:
         count = f"The {_LISTED_PAIRS} least explained of {len(contradicted):,} pairs; all are in report.json"
     head = "<tr><th>photo 0</th><th>photo 1</th><th>verified</th><th>explained</th></tr>"

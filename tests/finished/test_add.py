@@ -116,6 +116,8 @@ def test_report_verdict_and_page_tell_of_the_new_photos(grown: SceneToGrow) -> N
     report = json.loads((grown.workspace / "report.json").read_text())
     assert report["summary"]["num_registered"] == 7 and report["verdict"]["grade"] == "good"
     assert report["added"] == grown.new_names
+    remarks = json.loads((grown.workspace / "cameras.json").read_text())["remarks"]
+    assert remarks[-1] == f"added with the camera of photos like them: {', '.join(grown.new_names)}"
     assert grown.new_names[0] in (grown.workspace / "report.html").read_text()
 
 
