@@ -17,6 +17,7 @@ import pycolmap
 
 from corrsfm.errors import first_few
 from corrsfm.finished.advice import command_again, more_photos_to_add, more_photos_to_map, next_step
+from corrsfm.finished.integrity import Damage, find_damage
 from corrsfm.reconstruction.explained import CONTRADICTED_BELOW
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.stage import summarise
@@ -89,7 +90,7 @@ class SceneFinding:
     Attributes
     ----------
     kind : str
-        ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
+        ``damage``, ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
     text : str
     photos : tuple of str
     next_step : str
@@ -123,6 +124,7 @@ class WorkspaceCheck:
     missing : tuple of MissingPhoto
     findings : tuple of SceneFinding
         What to try first comes first: a wrong model, then what could gain most photos, then what is weak.
+        Where files are damaged, only that.
     """
 
     num_photos: int
@@ -154,12 +156,14 @@ class WorkspaceCheck:
         }
 
 
-def check_workspace(workspace: Path | str) -> WorkspaceCheck:
+def check_workspace(workspace: Path | str, *, integrity: bool = True) -> WorkspaceCheck:
     """Say what is weak about a reconstructed scene and what to try next; nothing is changed.
 
     Parameters
     ----------
     workspace : path
+    integrity : bool
+        First read every item of every file, see `corrsfm.finished.integrity.find_damage`.
 
     Returns
     -------
@@ -171,6 +175,9 @@ def check_workspace(workspace: Path | str) -> WorkspaceCheck:
         If its matches are not verified yet, or another process works there.
     """
     scene = Workspace(Path(workspace))
+    with scene.reading():
+        if damage := find_damage(scene) if integrity else []:
+            return _damaged(damage)
     with scene.reading(), _copied_database(scene):
         report, models = summarise(scene)
         held = _held_photos(report, models[0]) if models else ()
@@ -195,6 +202,18 @@ def check_workspace(workspace: Path | str) -> WorkspaceCheck:
         missing=report.missing,
         findings=tuple(findings),
     )
+
+
+def _damaged(damage: Sequence[Damage]) -> WorkspaceCheck:
+    """What can be said of a scene with damaged files: how to mend them."""
+    findings = tuple(
+        SceneFinding(kind="damage", text=f"{one.path}: {one.problem}", photos=(), next_step=one.remedy)
+        for one in damage
+    )
+    return WorkspaceCheck(
+        num_photos=0, num_registered=0, grade=None, verdict="", photos=(), parts=(), bridges=(), missing=(),
+        findings=findings,
+    )  # fmt: skip
 
 
 @contextlib.contextmanager
