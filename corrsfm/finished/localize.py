@@ -21,12 +21,12 @@ from corrsfm.colmap.cameras import camera_from_pycolmap, mean_focal_px, with_foc
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import read_models
 from corrsfm.errors import InputError
-from corrsfm.features import create_extractor
+from corrsfm.features import create_extractor, reads_colour
 from corrsfm.files import atomic_write_text
 from corrsfm.finished.incoming import PhotoPaths, find_photos, refuse_imported, require_readable
 from corrsfm.geometry import camera_centre
 from corrsfm.images.cameras import PhotoInfo, assign_cameras
-from corrsfm.images.photos import read_image, read_photo_info
+from corrsfm.images.photos import read_colour, read_image, read_photo_info
 from corrsfm.machine import count_threads, find_device, use_threads
 from corrsfm.matches.lightglue import LightGlueMatcher
 from corrsfm.matches.nearest import Matcher
@@ -224,7 +224,9 @@ class _Locator:
         self._camera_params = camera_params
         self._run = run
         self._device = find_device(run.device)
-        self._extract = create_extractor(self._options("features", cfg.FeaturesConfig), self._device)
+        features = self._options("features", cfg.FeaturesConfig)
+        self._extract = create_extractor(features, self._device)
+        self._read = read_colour if reads_colour(features.extractor) else read_image
         self._prune = build_pruner(
             self._options("pruned matches", cfg.PruneConfig),
             traits=traits_of(workspace),
@@ -251,7 +253,7 @@ class _Locator:
         keys = [f"{name}\n" for name, _ in photos]
         with colmap_log():
             own = {
-                key: self._extract(read_image(path), None)
+                key: self._extract(self._read(path), None)
                 for key, (_, path) in zip(keys, photos, strict=True)
             }
 

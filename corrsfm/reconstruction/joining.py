@@ -290,7 +290,7 @@ def _by_looks(
     return [(*rows_a[i], *rows_b[j]) for i, j in sorted(forward.items()) if backward.get(j) == i]
 
 
-def _nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> dict[int, int]:
+def _nearest(a: NDArray, b: NDArray) -> dict[int, int]:
     """Row of a → its nearest row of b, where it passes the ratio test against the second."""
     if len(a) == 0 or len(b) < 2:
         return {}
@@ -300,8 +300,8 @@ def _nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> dict[int, int]:
 
 def _described(
     model: pycolmap.Reconstruction, load: Callable[[str], Features]
-) -> tuple[list[tuple[int, int, int]], NDArray[np.uint8]]:
-    """An observation (image id, keypoint, point id) of each point, long tracks first, and its look."""
+) -> tuple[list[tuple[int, int, int]], NDArray]:
+    """An observation (image id, keypoint, point id) of each point, long tracks first, and its descriptor."""
     ranked = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
     rows = []
     for point_id, point in ranked[:_MAX_POINTS]:
@@ -310,11 +310,12 @@ def _described(
     by_image: dict[int, list[int]] = defaultdict(list)
     for number, row in enumerate(rows):
         by_image[row[0]].append(number)
-    descriptors = np.zeros((0, 128), np.uint8)
+    descriptors: NDArray = np.zeros((0, 128), np.uint8)
     for image_id, numbers in sorted(by_image.items()):
         own = load(model.images[image_id].name).descriptors
         if len(descriptors) == 0:
-            descriptors = np.zeros((len(rows), own.shape[1]), np.uint8)
+            # Bytes of SIFT, or floats of a network.
+            descriptors = np.zeros((len(rows), own.shape[1]), own.dtype)
         descriptors[numbers] = own[[rows[number][1] for number in numbers]]
     return rows, descriptors
 

@@ -47,8 +47,12 @@ def test_few_matches_of_each_pair_are_enough_together(tmp_path: Path) -> None:
     assert_joined_as_it_was(parts)
 
 
-def test_without_any_match_the_look_of_points_is_enough(tmp_path: Path) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60, num_cross_matches=0)
+@pytest.mark.parametrize("unit_descriptors", [False, True])
+def test_without_any_match_the_look_of_points_is_enough(unit_descriptors: bool, tmp_path: Path) -> None:
+    parts = make_two_parts(
+        tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60, num_cross_matches=0,
+        unit_descriptors=unit_descriptors,
+    )  # fmt: skip
     assert_joined_as_it_was(parts)
 
 
