@@ -113,7 +113,8 @@ def join_models(
     Returns
     -------
     models : list of pycolmap.Reconstruction
-        Those that are left; a joined model stands in the place of its larger part.
+        Those that are left; a joined model stands in the place of its larger part, or before models that are
+        smaller than it.
     attempts : list of Joining
         In the order of trying.
 
@@ -147,8 +148,9 @@ def join_models(
         joined, attempt = _join(left[i], left[j], database, evidence, options, seed)
         attempts.append(attempt)
         if joined is not None:
-            left[i] = joined
-            del left[j]
+            del left[j], left[i]
+            smaller = (k for k in range(i) if left[k].num_reg_images() < joined.num_reg_images())
+            left.insert(next(smaller, i), joined)
     return left, attempts
 
 
