@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import shutil
-import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -178,7 +175,6 @@ def check_workspace(workspace: Path | str, *, integrity: bool = True) -> Workspa
     with scene.reading():
         if damage := find_damage(scene) if integrity else []:
             return _damaged(damage)
-    with scene.reading(), _copied_database(scene):
         report, models = summarise(scene)
         held = _held_photos(report, models[0]) if models else ()
         bridges = _bridges(report)
@@ -214,22 +210,6 @@ def _damaged(damage: Sequence[Damage]) -> WorkspaceCheck:
         num_photos=0, num_registered=0, grade=None, verdict="", photos=(), parts=(), bridges=(), missing=(),
         findings=findings,
     )  # fmt: skip
-
-
-@contextlib.contextmanager
-def _copied_database(workspace: Workspace) -> Iterator[None]:
-    """Read a copy of the database: pycolmap writes into one that it only reads."""
-    original = workspace.database
-    with tempfile.TemporaryDirectory(prefix="corrsfm-check-") as folder:
-        for suffix in ("", "-wal"):
-            if (file := original.with_name(original.name + suffix)).is_file():
-                shutil.copyfile(file, Path(folder) / file.name)
-        if original.is_file():
-            workspace.database = Path(folder) / original.name
-        try:
-            yield
-        finally:
-            workspace.database = original
 
 
 def _held_photos(report: SceneReport, model: pycolmap.Reconstruction) -> tuple[HeldPhoto, ...]:
