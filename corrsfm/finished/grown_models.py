@@ -20,6 +20,7 @@ from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
+from corrsfm.reconstruction.calibration import adjustment_options
 from corrsfm.reconstruction.growth import grow
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.resection import Resection
@@ -79,6 +80,12 @@ def grow_models(
         record.name: index.camera_of(record).has_prior_focal_length or not config.refine_intrinsics
         for record in index.records
     }
+    num_threads = count_threads(run.threads)
+    refinement = adjustment_options(
+        intrinsics=config.refine_intrinsics,
+        principal_point=config.refine_principal_point,
+        num_threads=num_threads,
+    )
     placed: dict[str, tuple[int, Resection]] = {}
     last: dict[str, Resection] = {}
     num_new_points = 0
@@ -89,9 +96,9 @@ def grow_models(
             workspace.database,
             matches,
             known_focal=known_focal,
-            refinement=_refinement(config, count_threads(run.threads)) if refine else None,
+            refinement=refinement if refine else None,
             seed=run.seed,
-            num_threads=count_threads(run.threads),
+            num_threads=num_threads,
         )
         placed |= {name: (number, found) for name, found in growth.registered.items()}
         # What the first model says is what most want to know.
@@ -152,15 +159,6 @@ def _judge(workspace: Workspace, model: pycolmap.Reconstruction, seed: int) -> N
         logger.debug("%s: says nothing of models that were joined", workspace.evidence)
     atomic_write_json(workspace.evidence, record)
     logger.info("verdict: %s", selection.verdict)
-
-
-def _refinement(config: cfg.ReconstructionConfig, num_threads: int) -> pycolmap.BundleAdjustmentOptions:
-    """How a whole model is adjusted: what mapping left alone stays."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = config.refine_intrinsics
-    options.refine_principal_point = config.refine_principal_point
-    options.ceres.solver_options.num_threads = num_threads
-    return options
 
 
 def _restore_models(workspace: Workspace) -> None:
