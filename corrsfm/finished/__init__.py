@@ -10,5 +10,6 @@
     ├── add.py          photos that join the scene and its model, which does not move
     ├── localize.py     poses of photos that do not join
     ├── check.py        what holds the model weakly, and what is missing
+    ├── integrity.py    whether every file can be read to its end, and what makes it again
     └── advice.py       what to try next, as commands to paste
 """

@@ -68,7 +68,7 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             problem = f"damaged ({type(error).__name__}: {error})"
         else:
             continue
-        remove = shlex.join(["rm", "-r", str(path)])
+        remove = shlex.join(["rm", "-r", *map(str, _names_of(path, workspace))])
         remedy = (
             f"{remove}; {command_again(workspace, stage)}"
             if path.exists()
@@ -76,6 +76,15 @@ def find_damage(workspace: Workspace) -> list[Damage]:
         )
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return found
+
+
+def _names_of(path: Path, workspace: Workspace) -> list[Path]:
+    """All names of a file: that of a prune method's matches would bring the damage back."""
+    others = workspace.pruned_by("*")
+    same = [
+        other for other in sorted(others.parent.glob(others.name)) if path.exists() and path.samefile(other)
+    ]
+    return [path, *same]
 
 
 class _Reader:

@@ -88,8 +88,9 @@ def test_damage_is_named_and_its_remedy_mends_it(
     for command in first.next_step.split("; "):
         program, *words = shlex.split(command)
         if program == "rm":
-            shutil.rmtree(words[-1], ignore_errors=True)
-            Path(words[-1]).unlink(missing_ok=True)
+            for word in words[1:]:
+                shutil.rmtree(word, ignore_errors=True)
+                Path(word).unlink(missing_ok=True)
             continue
         outcome = CliRunner().invoke(main, ["-q", *words, "--threads", str(CONFIG.run.threads)])
         assert outcome.exit_code == 0, (command, outcome.output)
