@@ -25,6 +25,7 @@ from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, pol
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mapper import reconstruct as map_database
+from corrsfm.reconstruction.mapper import threads_for
 from corrsfm.reconstruction.record import record_of
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
@@ -207,7 +208,7 @@ class _Choice:
             seed=self._run.seed,
             refine_intrinsics=self._config.refine_intrinsics,
             refine_principal_point=self._config.refine_principal_point,
-            num_threads=count_threads(self._run.threads),
+            num_threads=threads_for(len(self._names), count_threads(self._run.threads)),
         )
         for attempt in attempts:
             logger.info("%s", attempt)
