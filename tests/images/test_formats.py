@@ -248,6 +248,18 @@ def test_a_record_of_copies_that_leads_out_of_the_folder_removes_nothing(tmp_pat
     assert precious.read_bytes() == b"mine" and not gone.exists()
 
 
+@pytest.mark.parametrize("name", ["a.avif", "a.heic"])
+def test_what_is_no_photo_is_not_decoded_whatever_its_suffix(tmp_path: Path, name: str) -> None:
+    image_module = pytest.importorskip("PIL.Image")
+    pytest.importorskip("PIL.AvifImagePlugin" if name == "a.avif" else "pillow_heif")
+    # Pillow would hand PostScript to another program.
+    image_module.fromarray(picture()).save(tmp_path / name, format="EPS")
+    with pytest.raises(ImageError, match="no photo"):
+        read_image(tmp_path / name)
+    image_module.fromarray(picture()).save(tmp_path / name, format="JPEG")
+    assert read_image(tmp_path / name).shape == picture().shape
+
+
 def test_names_of_copies() -> None:
     assert readable_name("sub/IMG.1.HEIC") == "sub/IMG.1.jpg"
     assert readable_name("a.png") == "a.png"
