@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import shlex
 import shutil
 import time
 from collections.abc import Callable
@@ -122,7 +123,7 @@ def _keep_grown_models(workspace: Workspace) -> None:
         logger.warning(
             "an addition of photos was not finished; all photos are mapped again instead, and every pose "
             "moves; to finish it instead, stop and run: corrsfm add %s",
-            workspace.root,
+            shlex.quote(str(workspace.root)),
         )
     added = read_added(workspace)
     if not added or not workspace.sparse.is_dir():
