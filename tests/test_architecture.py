@@ -44,6 +44,7 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
     ("workspace", "colmap"): "a stage asks whether the database it starts from is whole",
     ("report", "images"): "photos are decoded in one place, images/photos.py",
     ("training", "evaluation"): "training is judged by evaluation's metrics",
+    ("finished", "pipeline"): "an addition checks its options as a run does, before any work",
     ("__main__", "cli"): "python -m corrsfm",
 }
 # The rooms that may import a third-party package.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,13 +29,18 @@ from corrsfm.finished.arrival import (
     Pending,
     copy_photos,
     pending_addition,
-    refuse_what_cannot_join,
     require_folder,
     sort_out,
 )
 from corrsfm.finished.grown_lists import cameras_of_new, grown_index
 from corrsfm.finished.grown_models import ORIGIN, grow_models
-from corrsfm.finished.incoming import PhotoPaths, find_photos, refuse_imported, require_readable
+from corrsfm.finished.incoming import (
+    PhotoPaths,
+    find_photos,
+    make_readable,
+    refuse_imported,
+    require_readable,
+)
 from corrsfm.images.cache import PhotoCache
 from corrsfm.images.index import duplicate_images, name_remarks
 from corrsfm.images.stage import fingerprint_of as index_fingerprint
@@ -42,6 +48,7 @@ from corrsfm.machine import count_threads, find_device
 from corrsfm.matches.stage import match_pairs
 from corrsfm.pairs.stage import fingerprint_of as pairs_fingerprint
 from corrsfm.pairs.strategies import pairs_of_new_photos
+from corrsfm.pipeline import check_options
 from corrsfm.prune.stage import prune_matches
 from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
@@ -152,12 +159,13 @@ def add_photos(
         If the scene has no current model, or another process works there.
     """
     scene = Workspace(Path(workspace))
-    with scene.lock():
+    with scene.lock(), tempfile.TemporaryDirectory() as scratch:
         run = _with_seed(run or cfg.RunConfig(), scene)
         refuse_imported(scene)
         pending = pending_addition(scene)
         find_device(run.device)
-        incoming, already = sort_out(find_photos(photos, scene.images_dir), scene, pending.photos)
+        found = make_readable(find_photos(photos, scene.images_dir), Path(scratch))
+        incoming, already = sort_out(found, scene, pending.photos)
         wanted = {**pending.photos, **{photo.name: photo.sha256 for photo in incoming}}
         if not wanted:
             if not already:
@@ -166,12 +174,12 @@ def add_photos(
                 )
             return AddResult(photos=(), already_there=already)
         require_folder(scene, incoming, wanted)
-        refuse_what_cannot_join(incoming)
         require_readable(incoming)
         pending = dataclasses.replace(pending, photos=wanted, refine=refine or pending.refine)
         addition = _Addition(scene, pending, run)
         # Whatever does not fit is refused before anything is changed.
-        addition.grown_index({photo.name: photo.path for photo in incoming})
+        addition.check_options()
+        addition.grown_index({photo.name: photo.file for photo in incoming})
         atomic_write_json(scene.adding, dataclasses.asdict(pending))
         copy_photos(incoming, scene.images_dir)
         return addition.finish(already)
@@ -198,6 +206,16 @@ class _Addition:
 
     def _options(self, stage: str, options: type[T]) -> T:
         return cfg.from_dict(options, self._recorded[stage], f"{self._workspace.adding}: {stage}")
+
+    def check_options(self) -> None:
+        """Check that the networks of the scene are here; raises as `corrsfm.pipeline.check_options`."""
+        check_options(
+            self._run,
+            self._options("pruned matches", cfg.PruneConfig),
+            features=self._options("features", cfg.FeaturesConfig),
+            matches=self._options("matches", cfg.MatchesConfig),
+            workspace_dir=self._workspace.root,
+        )
 
     def finish(self, already: tuple[str, ...]) -> AddResult:
         """Do what is left to do."""
@@ -268,11 +286,19 @@ class _Addition:
                 "next run leaves them out",
                 config.image_list,
             )
-        given = self._workspace.given_photos
-        if self._workspace.images_dir.resolve() not in [Path(photos).resolve() for photos in given]:
+        workspace, given = self._workspace, self._workspace.given_photos
+        if workspace.images_dir in (workspace.frames, workspace.converted):
+            if str(workspace.images_dir.resolve()) not in given:
+                logger.warning(
+                    "a run of %s leaves the new photos out; to go on with them: %s",
+                    first_few(given),
+                    workspace.command_for("images", images_dir=str(workspace.images_dir)),
+                )
+        elif workspace.images_dir.resolve() not in [Path(photos).resolve() for photos in given]:
             logger.warning(
-                "this scene was made of %s: the next run takes what that holds, without the new photos",
+                "this scene was made of %s: name the new photos in %s too, or the next run leaves them out",
                 first_few(given),
+                workspace.images_dir,
             )
 
     def _pairs(self) -> StageOutcome:

@@ -7,6 +7,7 @@ import shlex
 from corrsfm.report.missing import MissingPhoto, MissingReason
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
+from corrsfm.workspace.imported import imported_from
 
 __all__ = ["command_again", "more_photos_to_add", "more_photos_to_map", "next_step"]
 
@@ -49,7 +50,10 @@ def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
 
 
 def more_photos_to_add(workspace: Workspace, where: str) -> str:
-    """Photos that make a model firmer, which stays where it is."""
+    """Photos that make a model firmer, which stays where it is unless its features were imported."""
+    if imported_from(workspace, "features") is not None:
+        command = f"{workspace.command_for('features')} --overwrite"
+        return f"take photos {where}, make a file of features that holds them too, then: {command}"
     return f"take photos {where}, then: corrsfm add {shlex.quote(str(workspace.root))} NEWPHOTOS"
 
 

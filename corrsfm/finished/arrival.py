@@ -13,7 +13,6 @@ from typing import Any
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.finished.incoming import Incoming
-from corrsfm.images.convert import is_converted
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.lists import read_index
@@ -22,7 +21,6 @@ __all__ = [
     "Pending",
     "copy_photos",
     "pending_addition",
-    "refuse_what_cannot_join",
     "require_folder",
     "sort_out",
 ]
@@ -122,28 +120,13 @@ def require_folder(workspace: Workspace, incoming: Sequence[Incoming], wanted: M
         )
 
 
-def refuse_what_cannot_join(incoming: Sequence[Incoming]) -> None:
-    """Check that other tools can read the photos.
-
-    Raises
-    ------
-    InputError
-        If there are HEIC or AVIF photos among them.
-    """
-    if converted := [photo.name for photo in incoming if is_converted(photo.name)]:
-        raise InputError(
-            f"{first_few(converted)}: cannot be added as they are, for other tools do not read them; make "
-            "JPEGs of them, or put them beside the scene's photos and run the scene again"
-        )
-
-
 def copy_photos(incoming: Sequence[Incoming], folder: Path) -> None:
     """Copy the photos that lie elsewhere into the folder of the scene's photos."""
     outside = [photo for photo in incoming if not (folder / photo.name).is_file()]
     for photo in outside:
         try:
             with atomic_path(folder / photo.name) as temporary:
-                shutil.copy2(photo.path, temporary)
+                shutil.copy2(photo.file, temporary)
         except OSError as error:
             raise InputError(
                 f"{folder / photo.name}: cannot be written ({error.strerror}); put the new photos into the "

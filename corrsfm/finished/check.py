@@ -388,7 +388,7 @@ def _weak(held: Sequence[HeldPhoto], workspace: Workspace) -> list[SceneFinding]
     return [
         SceneFinding(
             kind="weak",
-            text=f"{len(weak)} registered photos are weakly held (half of all see {usual} points or more): "
+            text=f"{len(weak)} of {len(held)} photos weakly held (half of all see {usual} points or more): "
             + first_few(f"{photo.name}: {photo.weakness}" for photo in weak),
             photos=tuple(photo.name for photo in weak),
             next_step=more_photos_to_add(workspace, f"next to {first_few(photo.name for photo in weak)}"),

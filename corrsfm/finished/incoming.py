@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from corrsfm.errors import ImageError, InputError
 from corrsfm.files import sha256_of
-from corrsfm.images.listing import list_images
-from corrsfm.images.photos import read_image
+from corrsfm.images.convert import readable_name
+from corrsfm.images.listing import VIDEO_SUFFIXES, list_images
+from corrsfm.images.photos import convert_photo, read_image
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import imported_from
 
-__all__ = ["Incoming", "PhotoPaths", "find_photos", "name_in", "refuse_imported", "require_readable"]
+__all__ = [
+    "Incoming",
+    "PhotoPaths",
+    "find_photos",
+    "make_readable",
+    "name_in",
+    "refuse_imported",
+    "require_readable",
+]
 
 PhotoPaths = Path | str | Sequence[Path | str]
 """Photos, and folders of photos."""
@@ -29,12 +40,15 @@ class Incoming:
         What it is called in the scene.
     path : Path
         Where it lies now.
+    file : Path
+        What joins the scene: the photo itself, or a JPEG that was made of it.
     sha256 : str
-        Of its bytes.
+        Of that file's bytes.
     """
 
     name: str
     path: Path
+    file: Path
     sha256: str
 
 
@@ -53,20 +67,26 @@ def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
     Raises
     ------
     InputError
-        If a path does not exist, a folder holds no photo, or two different photos would have one name.
+        If a path does not exist or is a video, a folder holds no photo, or two different photos would have
+        one name.
     """
     given = [Path(paths)] if isinstance(paths, Path | str) else [Path(path) for path in paths]
     found: dict[str, Incoming] = {}
     for path in given:
         if path.is_dir():
             files = [(name, path / name) for name in list_images(path, at_least=1)]
+        elif path.suffix.lower() in VIDEO_SUFFIXES:
+            raise InputError(
+                f"{path}: is a video; take its frames with: corrsfm extract {shlex.quote(str(path))} FILM, "
+                "then give FILM/frames or some of its photos"
+            )
         elif path.is_file():
             files = [(path.name, path)]
         else:
             raise InputError(f"{path}: no such photo or folder")
         for name, file in files:
             called = str(file) if images_dir is None else name_in(file, images_dir) or name
-            photo = Incoming(name=called, path=file, sha256=sha256_of(file))
+            photo = Incoming(name=called, path=file, file=file, sha256=sha256_of(file))
             other = found.setdefault(photo.name, photo)
             if other.sha256 != photo.sha256:
                 raise InputError(
@@ -74,6 +94,36 @@ def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
                     "rename one of them"
                 )
     return [found[name] for name in sorted(found)]
+
+
+def make_readable(photos: Sequence[Incoming], folder: Path) -> list[Incoming]:
+    """The photos as they join a scene: of HEIC and AVIF photos, which other tools do not read, the JPEGs.
+
+    As in a scene, such a photo beside a JPEG of the same name is left out.
+
+    Parameters
+    ----------
+    photos : sequence of Incoming
+    folder : Path
+        For the JPEGs. The same photo gives the same bytes every time, so that an addition can go on.
+
+    Raises
+    ------
+    ImageError, DependencyError
+        If a photo cannot be converted.
+    """
+    names = {photo.name for photo in photos}
+    readable = []
+    for number, photo in enumerate(photos):
+        name = readable_name(photo.name)
+        if name == photo.name:
+            readable.append(photo)
+        elif name not in names:
+            names.add(name)
+            jpeg = folder / f"{number}.jpg"
+            convert_photo(photo.path, jpeg)
+            readable.append(dataclasses.replace(photo, name=name, file=jpeg, sha256=sha256_of(jpeg)))
+    return readable
 
 
 def name_in(file: Path, folder: Path) -> str:

@@ -208,7 +208,9 @@ def load_network(
             f"{file}: holds no 'state_dict'; expected a checkpoint of corrsfm or the published code"
         )
     if architecture not in (None, found):
-        raise CheckpointError(f"{file}: holds the network {found}, expected {architecture}")
+        raise CheckpointError(
+            f"{file}: holds the network {found}, expected {architecture}; --method {found} reads it"
+        )
     fill_network(network.to(map_location), state, f"{file}: not a checkpoint of this network ({found})")
     if "usage" in content:
         network.usage = _read_usage(content["usage"], file)

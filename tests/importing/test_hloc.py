@@ -14,6 +14,7 @@ import corrsfm
 from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.errors import ConfigError, CorrsfmError, InputError, WorkspaceError
+from corrsfm.finished.advice import more_photos_to_add
 from corrsfm.importing.scene import import_features
 from corrsfm.workspace import Workspace
 
@@ -73,6 +74,14 @@ def test_the_stages_go_on_from_imported_features_and_keep_them(
     matches = corrsfm.open_workspace(tmp_path / "scene").matches((names[0], names[1]))
     np.testing.assert_array_equal(matches.indices[:, 0], matches.indices[:, 1])
     assert matches.mutual.all() and (matches.ratios == 0).all()
+
+
+def test_more_photos_of_imported_features_are_asked_for_by_import(
+    photos: Path, features: Path, tmp_path: Path
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features)
+    step = more_photos_to_add(Workspace(tmp_path / "scene"), "next to a.jpg")
+    assert "corrsfm import" in step and step.endswith("--overwrite") and "corrsfm add" not in step
 
 
 def test_matches_come_in_and_are_not_made_again(

@@ -88,7 +88,7 @@ def test_what_does_not_fit_is_refused_before_any_work(tmp_path):
     with pytest.raises(ConfigError, match="--method clnet: no weights of this network come with corrsfm"):
         build_pruner(PruneConfig(method=PruneMethod.CLNET), device="cpu")
     save_network(build_rival(RivalConfig(architecture="oanet", channels=8, clusters=4)), tmp_path / "o.pt")
-    with pytest.raises(CheckpointError, match="holds the network oanet, expected clnet"):
+    with pytest.raises(CheckpointError, match="oanet, expected clnet; --method oanet reads it"):
         build_pruner(PruneConfig(method=PruneMethod.CLNET, model=tmp_path / "o.pt"), device="cpu")
     assert 3 not in SIDE_LAYOUTS
     save_network(

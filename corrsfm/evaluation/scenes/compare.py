@@ -109,6 +109,8 @@ def compare_methods(
     if not folders or len(set(folders)) < len(folders) or "base" in folders:
         raise ConfigError(f"methods {', '.join(methods)}: give at least one, and each only once")
     wanted_seeds(config.run.seed, num_seeds)
+    for prune_config in prune_configs.values():
+        pipeline.check_options(config.run, prune_config, features=config.features, matches=config.matches)
     truth = read_truth(ground_truth) if ground_truth else None
     base = Workspace(output / "base", create=True)
     _prepare(base, images_dir, config, overwrite)

@@ -248,6 +248,12 @@ def test_methods_that_cannot_be_compared_are_refused(tmp_path: Path, methods: li
     assert not (tmp_path / "out").exists()
 
 
+def test_a_network_without_weights_is_refused_before_any_work(tmp_path: Path):
+    with pytest.raises(ConfigError, match="clnet:FILE in a list of methods"):
+        compare_methods(tmp_path, tmp_path / "out", ["ratio", "clnet"], CONFIG, num_seeds=1)
+    assert not (tmp_path / "out").exists()
+
+
 def test_folder_names_are_safe():
     assert method_folder("corradaptor@pose:/models/a b.pt") == "corradaptor_pose_models_a_b.pt"
     assert method_folder("../") == "_"
