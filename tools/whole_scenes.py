@@ -88,6 +88,19 @@ SETTINGS: list[Plain | Corrsfm] = [
         extract=("--extractor", "pycolmap"),
         prune=("--method", "corradaptor"),
     ),
+    *(
+        Corrsfm(
+            name=f"corrsfm ALIKED, {name}",
+            column=f"corrsfm ALIKED, {name}",
+            extract=("--extractor", "aliked", "--max-features", "2048", "--matcher", matcher),
+            prune=("--method", *prune),
+        )
+        for name, matcher, prune in (
+            ("loransac", "nearest", ("loransac",)),
+            ("small-aliked", "nearest", ("corradaptor", "--model", "small-aliked")),
+            ("LightGlue", "lightglue", ("none",)),
+        )
+    ),
 ]
 
 

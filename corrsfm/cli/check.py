@@ -36,6 +36,12 @@ PATH = click.Path(path_type=Path)
     show_default=True,
     help="Run the first stages on a few photos, about ten seconds, to tell minutes and disk of a run.",
 )
+@click.option(
+    "--integrity/--no-integrity",
+    default=True,
+    show_default=True,
+    help="Of a workspace, read every item of every file.",
+)
 @click.option("--threads", type=click.IntRange(0), default=0, help="Photos read at a time; 0 is all cores.")
 @json_option
 def check(
@@ -43,6 +49,7 @@ def check(
     keep: Path | None,
     mask_dir: Path | None,
     forecast: bool,
+    integrity: bool,
     threads: int,
     as_json: bool,
 ) -> None:
@@ -52,12 +59,13 @@ def check(
     whose exposure is far from that of the others, and masks that do not fit, and says what is known of
     cameras and what a run will cost. Ends with code 1 if a run would stop.
 
-    Of a workspace: says which photos are missing or weakly held and by what, which photos would bridge the
-    parts of the scene, and what to try next, most promising first. Changes nothing. Ends with code 1 if there
-    is no model or the verdict on it is "wrong".
+    Of a workspace: says which files are damaged and how to make them again, which photos are missing or
+    weakly held and by what, which photos would bridge the parts of the scene, and what to try next, most
+    promising first. Changes nothing. Ends with code 1 if there is damage or no model, or if the verdict on it
+    is "wrong".
     """
     if len(photos) == 1 and (photos[0] / "workspace.json").is_file():
-        show_workspace(photos[0], as_json)
+        show_workspace(photos[0], as_json, integrity)
         return
     from corrsfm.config import PipelineConfig, RunConfig
     from corrsfm.files import atomic_write_text

@@ -118,15 +118,16 @@ def localize(
         raise click.exceptions.Exit(1)
 
 
-def show_workspace(workspace_dir: Path, as_json: bool) -> None:
+def show_workspace(workspace_dir: Path, as_json: bool, integrity: bool) -> None:
     """What `corrsfm check` prints of a workspace; raises Exit if its model is not fit to be used."""
     from corrsfm.finished.check import check_workspace
 
-    result = check_workspace(workspace_dir)
+    result = check_workspace(workspace_dir, integrity=integrity)
     if as_json:
         echo_json(result.to_dict())
     else:
-        click.echo(f"{workspace_dir}: {result.num_registered} of {result.num_photos} photos registered")
+        if result.num_photos:
+            click.echo(f"{workspace_dir}: {result.num_registered} of {result.num_photos} photos registered")
         if result.verdict:
             click.echo(f"verdict: {result.verdict}")
         weak = [photo for photo in result.photos if photo.weakness]

@@ -11,26 +11,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
-import os
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-import pycolmap
-
 from corrsfm import config as cfg
-from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.models import read_models
-from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
 from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
-from corrsfm.files import atomic_path, atomic_write_json
+from corrsfm.files import atomic_write_json
 from corrsfm.finished.advice import next_step
 from corrsfm.finished.arrival import (
     Pending,
@@ -40,6 +33,7 @@ from corrsfm.finished.arrival import (
     sort_out,
 )
 from corrsfm.finished.grown_lists import cameras_of_new, grown_index
+from corrsfm.finished.grown_models import ORIGIN, grow_models
 from corrsfm.finished.incoming import (
     PhotoPaths,
     find_photos,
@@ -56,11 +50,6 @@ from corrsfm.pairs.stage import fingerprint_of as pairs_fingerprint
 from corrsfm.pairs.strategies import pairs_of_new_photos
 from corrsfm.pipeline import check_options
 from corrsfm.prune.stage import prune_matches
-from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
-from corrsfm.reconstruction.growth import grow
-from corrsfm.reconstruction.record import record_of
-from corrsfm.reconstruction.resection import Resection
-from corrsfm.reconstruction.stage import fingerprint_of as models_fingerprint
 from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import Camera, Pair, PairList
@@ -73,8 +62,6 @@ from corrsfm.workspace.store import ItemStore
 __all__ = ["AddResult", "AddedPhoto", "add_photos"]
 
 logger = logging.getLogger("corrsfm")
-
-_ORIGIN = "added"
 
 T = TypeVar("T")
 
@@ -338,7 +325,7 @@ class _Addition:
         origins: dict[Pair, tuple[str, ...]] = dict(zip(known.pairs, known.origins, strict=True))
         # A user's list may hold a pair the other way round.
         there = {frozenset(pair) for pair in known.pairs}
-        origins |= {pair: (_ORIGIN,) for pair in proposed if frozenset(pair) not in there}
+        origins |= {pair: (ORIGIN,) for pair in proposed if frozenset(pair) not in there}
         pairs = tuple(sorted(origins))
         write_pairs(workspace, PairList(pairs=pairs, origins=tuple(origins[pair] for pair in pairs)))
         outcome = StageOutcome(
@@ -400,93 +387,13 @@ class _Addition:
         atomic_write_json(path, {"remarks": remarks})
 
     def _models(self) -> int:
-        """Put the new photos into the models, the first one first; the number of new points."""
-        workspace, run, started = self._workspace, self._run, time.monotonic()
-        _restore_models(workspace)
-        verified = workspace.require("verified matches")
+        """Put the new photos into the models; the number of new points."""
         config = self._options("models", cfg.ReconstructionConfig)
-        fingerprint = models_fingerprint(verified.fingerprint, config, run.seed)
-        if workspace.is_current("models", fingerprint, workspace.sparse / "0", workspace.added):
-            return 0
-        models = read_models(workspace.sparse)
-        matches = read_verified_matches(workspace.database)
-        index = read_index(workspace)
-        known_focal = {
-            record.name: index.camera_of(record).has_prior_focal_length or not config.refine_intrinsics
-            for record in index.records
-        }
-        placed: dict[str, tuple[int, Resection]] = {}
-        last: dict[str, Resection] = {}
-        num_new_points = 0
-        for number, model in enumerate(models):
-            growth = grow(
-                model,
-                [name for name in self._new if name not in placed],
-                workspace.database,
-                matches,
-                known_focal=known_focal,
-                refinement=_refinement(config, count_threads(run.threads)) if self._refine else None,
-                seed=run.seed,
-                num_threads=count_threads(run.threads),
-            )
-            placed |= {name: (number, found) for name, found in growth.registered.items()}
-            # What the first model says is what most want to know.
-            last = {**growth.failed, **last}
-            if growth.registered:
-                num_new_points += growth.num_new_points
-                models[number] = growth.model
-                _colour(growth.model, growth.registered, workspace.images_dir)
-        self._write(models, placed, last)
-        outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
-        finish(workspace, outcome, fingerprint, config, inputs={"verified matches": verified.fingerprint})
+        outcome, num_new_points = grow_models(
+            self._workspace, self._new, config, self._run, refine=self._refine
+        )
         self._say(outcome)
         return num_new_points
-
-    def _write(
-        self,
-        models: Sequence[pycolmap.Reconstruction],
-        placed: Mapping[str, tuple[int, Resection]],
-        last: Mapping[str, Resection],
-    ) -> None:
-        """Write the models, what became of each photo, and the verdict."""
-        workspace = self._workspace
-        held = {
-            image.name: number
-            for number, model in reversed(list(enumerate(models)))
-            for image in model.images.values()
-            if image.has_pose
-        }
-        before = read_added(workspace)
-        record = {}
-        for name in self._new:
-            found = placed[name][1] if name in placed else last.get(name)
-            # An interrupted addition may have placed it before.
-            numbers = before.get(name, {}) if found is None else _numbers(found)
-            record[name] = {**numbers, "model": held.get(name)}
-        atomic_write_json(workspace.added, {"photos": {**before, **record}})
-        with atomic_path(workspace.sparse) as temporary:
-            for number, model in enumerate(models):
-                (temporary / str(number)).mkdir(parents=True)
-                model.write_binary(temporary / str(number))
-        if workspace.evidence.exists():
-            self._judge(models[0])
-
-    def _judge(self, model: pycolmap.Reconstruction) -> None:
-        """Write the verdict on the first model as it is now."""
-        workspace = self._workspace
-        with ItemStore(workspace.features, FEATURES).reader() as load:
-            names, verified = read_index(workspace).names, read_verified_matches(workspace.database)
-            evidence = SceneEvidence(names, verified, load, seed=self._run.seed)
-            reason = "photos were added to a finished model"
-            selection = judge_as_it_is(model, evidence, name=_ORIGIN, reason=reason)
-            record = record_of(selection, evidence)
-        try:
-            before = json.loads(workspace.evidence.read_text(encoding="utf-8"))
-            record |= {"joinings": before["joinings"]}
-        except (ValueError, KeyError, TypeError):
-            logger.debug("%s: says nothing of models that were joined", workspace.evidence)
-        atomic_write_json(workspace.evidence, record)
-        logger.info("verdict: %s", selection.verdict)
 
     def _outcomes(self, summary: SceneReport) -> tuple[AddedPhoto, ...]:
         """What became of each photo, with a reason and a next step where it joined no model."""
@@ -511,36 +418,3 @@ class _Addition:
                 )
             )
         return tuple(outcomes)
-
-
-def _refinement(config: cfg.ReconstructionConfig, num_threads: int) -> pycolmap.BundleAdjustmentOptions:
-    """How a whole model is adjusted: what mapping left alone stays."""
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = config.refine_intrinsics
-    options.refine_principal_point = config.refine_principal_point
-    options.ceres.solver_options.num_threads = num_threads
-    return options
-
-
-def _restore_models(workspace: Workspace) -> None:
-    """Put the models back if an interruption came while their folder was replaced."""
-    aside = workspace.sparse.with_name(f".{workspace.sparse.name}.old")
-    if not workspace.sparse.exists() and aside.is_dir():
-        os.replace(aside, workspace.sparse)
-
-
-def _colour(model: pycolmap.Reconstruction, names: Mapping[str, Resection], folder: Path) -> None:
-    """Colour the points that have no colour yet by the new photos."""
-    with colmap_log():
-        for name in names:
-            model.extract_colors_for_image(model.find_image_with_name(name).image_id, folder)
-
-
-def _numbers(found: Resection) -> dict[str, Any]:
-    """What is kept of a search for a pose."""
-    return {
-        "num_inliers": found.num_inliers,
-        "num_candidates": found.num_candidates,
-        "median_error_px": found.median_error_px if np.isfinite(found.median_error_px) else None,
-        "why_not": found.why_not,
-    }

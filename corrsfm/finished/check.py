@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import shutil
-import tempfile
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +14,7 @@ import pycolmap
 
 from corrsfm.errors import first_few
 from corrsfm.finished.advice import command_again, more_photos_to_add, more_photos_to_map, next_step
+from corrsfm.finished.integrity import Damage, find_damage
 from corrsfm.reconstruction.explained import CONTRADICTED_BELOW
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.stage import summarise
@@ -89,7 +87,7 @@ class SceneFinding:
     Attributes
     ----------
     kind : str
-        ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
+        ``damage``, ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
     text : str
     photos : tuple of str
     next_step : str
@@ -123,6 +121,7 @@ class WorkspaceCheck:
     missing : tuple of MissingPhoto
     findings : tuple of SceneFinding
         What to try first comes first: a wrong model, then what could gain most photos, then what is weak.
+        Where files are damaged, only that.
     """
 
     num_photos: int
@@ -154,12 +153,14 @@ class WorkspaceCheck:
         }
 
 
-def check_workspace(workspace: Path | str) -> WorkspaceCheck:
+def check_workspace(workspace: Path | str, *, integrity: bool = True) -> WorkspaceCheck:
     """Say what is weak about a reconstructed scene and what to try next; nothing is changed.
 
     Parameters
     ----------
     workspace : path
+    integrity : bool
+        First read every item of every file, see `corrsfm.finished.integrity.find_damage`.
 
     Returns
     -------
@@ -171,7 +172,9 @@ def check_workspace(workspace: Path | str) -> WorkspaceCheck:
         If its matches are not verified yet, or another process works there.
     """
     scene = Workspace(Path(workspace))
-    with scene.reading(), _copied_database(scene):
+    with scene.reading():
+        if damage := find_damage(scene) if integrity else []:
+            return _damaged(damage)
         report, models = summarise(scene)
         held = _held_photos(report, models[0]) if models else ()
         bridges = _bridges(report)
@@ -197,20 +200,16 @@ def check_workspace(workspace: Path | str) -> WorkspaceCheck:
     )
 
 
-@contextlib.contextmanager
-def _copied_database(workspace: Workspace) -> Iterator[None]:
-    """Read a copy of the database: pycolmap writes into one that it only reads."""
-    original = workspace.database
-    with tempfile.TemporaryDirectory(prefix="corrsfm-check-") as folder:
-        for suffix in ("", "-wal"):
-            if (file := original.with_name(original.name + suffix)).is_file():
-                shutil.copyfile(file, Path(folder) / file.name)
-        if original.is_file():
-            workspace.database = Path(folder) / original.name
-        try:
-            yield
-        finally:
-            workspace.database = original
+def _damaged(damage: Sequence[Damage]) -> WorkspaceCheck:
+    """What can be said of a scene with damaged files: how to mend them."""
+    findings = tuple(
+        SceneFinding(kind="damage", text=f"{one.path}: {one.problem}", photos=(), next_step=one.remedy)
+        for one in damage
+    )
+    return WorkspaceCheck(
+        num_photos=0, num_registered=0, grade=None, verdict="", photos=(), parts=(), bridges=(), missing=(),
+        findings=findings,
+    )  # fmt: skip
 
 
 def _held_photos(report: SceneReport, model: pycolmap.Reconstruction) -> tuple[HeldPhoto, ...]:

@@ -74,7 +74,9 @@ def grown_index(
         if group not in camera_of_group:
             camera_of_group[group] = len(cameras)
             cameras.append(camera)
-    masks = find_masks(config.mask_dir, folder, names)
+    # Masks are named like the user's photos, not like the JPEGs that were made of them.
+    known_masks = {name: record.mask.removesuffix(".png") for name, record in before.items() if record.mask}
+    masks = find_masks(config.mask_dir, folder, [known_masks.get(name, name) for name in names])
     records = []
     for name, group, info, mask in zip(names, groups, infos, masks, strict=True):
         records.append(

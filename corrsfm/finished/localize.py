@@ -28,8 +28,7 @@ from corrsfm.geometry import camera_centre
 from corrsfm.images.cameras import PhotoInfo, assign_cameras
 from corrsfm.images.photos import read_colour, read_image, read_photo_info
 from corrsfm.machine import count_threads, find_device, use_threads
-from corrsfm.matches.lightglue import LightGlueMatcher
-from corrsfm.matches.nearest import Matcher
+from corrsfm.matches import create_matcher
 from corrsfm.pairs.strategies import pairs_of_new_photos
 from corrsfm.prune import build_pruner, make_correspondences
 from corrsfm.reconstruction.resection import (
@@ -273,11 +272,8 @@ class _Locator:
             inside = [name for name in pair if name not in own]
             if len(inside) == 1:
                 partners[pair[0] if pair[1] == inside[0] else pair[1]].append(inside[0])
-        match: Callable[[str, str], Matches]
-        if self._options("matches", cfg.MatchesConfig).matcher is cfg.Matcher.LIGHTGLUE:
-            match = LightGlueMatcher(load, traits_of(self._workspace).features, device=self._device).match
-        else:
-            match = Matcher(lambda name: load(name).descriptors, device=self._device).match
+        options, kind = self._options("matches", cfg.MatchesConfig), traits_of(self._workspace).features
+        match = create_matcher(options, load, kind, device=self._device)
         located = []
         for key, (name, path) in zip(keys, photos, strict=True):
             info = read_photo_info(path)

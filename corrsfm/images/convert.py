@@ -102,9 +102,13 @@ def _copy(
 
 
 def _record_of(folder: Path) -> dict[str, str]:
-    """Copies in a folder, with the hash of the photo that each was made from."""
+    """Copies in a folder, with the hash of the photo that each was made from.
+
+    Names that lead out of the folder are left out: a workspace may come from anybody, and copies are removed.
+    """
     try:
-        return dict(json.loads((folder / OWN_RECORD).read_text(encoding="utf-8")))
+        record = dict(json.loads((folder / OWN_RECORD).read_text(encoding="utf-8")))
+        return {name: sha256 for name, sha256 in record.items() if _is_inside(name)}
     except FileNotFoundError:
         if folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):
             raise WorkspaceError(
@@ -114,6 +118,11 @@ def _record_of(folder: Path) -> dict[str, str]:
     except (OSError, ValueError, TypeError):
         pass
     return {}
+
+
+def _is_inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts
 
 
 def _link(photo: Path, link: Path) -> None:

@@ -129,6 +129,9 @@ def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMRE
 
 def _decode_modern(path: Path, content: bytes, advice: str) -> tuple[NDArray[np.uint8], bytes]:
     """Colours (H, W, 3) of a HEIC or AVIF photo, blue first, and its EXIF data, empty if it has none."""
+    # Pillow goes by content, and for some formats it starts other programs. Photos with a wrong suffix are
+    # common.
+    formats = ["AVIF", "JPEG", "PNG"]
     try:
         from PIL import AvifImagePlugin, Image  # noqa: F401
 
@@ -136,10 +139,11 @@ def _decode_modern(path: Path, content: bytes, advice: str) -> tuple[NDArray[np.
             from pillow_heif import register_heif_opener
 
             register_heif_opener()
+            formats.append("HEIF")
     except ImportError as error:
         raise DependencyError("pillow-heif", f"reading {path}", "heif") from error
     try:
-        with Image.open(io.BytesIO(content)) as photo:
+        with Image.open(io.BytesIO(content), formats=formats) as photo:
             colours = np.asarray(photo.convert("RGB"), np.uint8)
             exif = photo.info.get("exif") or b""
     except Image.DecompressionBombError as error:

@@ -10,15 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.colmap.sqlite import is_sqlite, is_truncated
+from corrsfm.colmap.sqlite import PAIR_BASE, is_sqlite, is_truncated
 from corrsfm.errors import InputError
 from corrsfm.importing.checks import features_from, matches_from
 from corrsfm.types import Features, Matches, Pair
 
 __all__ = ["DatabaseSource", "open_database"]
 
-# A pair's id is this times the smaller image id plus the larger.
-_PAIR_BASE = 2**31 - 1
 _SIFT_SIZE = 128
 
 
@@ -37,7 +35,9 @@ def open_database(path: Path, *, with_matches: bool) -> Iterator[DatabaseSource]
     if is_truncated(path):
         raise InputError(f"{path}: damaged, its end is missing; copy or make it again")
     try:
-        with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
+        # As URI, because a name may hold a question mark or a hash.
+        uri = f"{path.absolute().as_uri()}?mode=ro"
+        with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
             yield DatabaseSource(path, connection, with_matches=with_matches)
     except sqlite3.Error as error:
         raise InputError(
@@ -98,7 +98,7 @@ class DatabaseSource:
         name_of = {image_id: name for name, image_id in self._ids.items()}
         found: dict[Pair, tuple[int, bool]] = {}
         for (pair_id,) in self._connection.execute("SELECT pair_id FROM matches WHERE rows > 0"):
-            ids = divmod(int(pair_id), _PAIR_BASE)
+            ids = divmod(int(pair_id), PAIR_BASE)
             if not all(image_id in name_of for image_id in ids):
                 raise InputError(
                     f"{self.label}: matches of images {ids[0]} and {ids[1]}, which have no keypoints"

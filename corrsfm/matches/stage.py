@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from corrsfm import config as cfg
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
-from corrsfm.matches.lightglue import LightGlueMatcher
-from corrsfm.matches.nearest import Matcher
+from corrsfm.matches import create_matcher
 from corrsfm.types import Matches, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import FEATURES, MATCHES
@@ -48,14 +47,7 @@ def match_pairs(
     on_cpu = device == "cpu"
     use_threads(1 if on_cpu else count_threads(run.threads))
     with ItemStore(workspace.features, FEATURES).reader() as read:
-        match: Callable[[str, str], Matches]
-        if config.matcher == cfg.Matcher.LIGHTGLUE:
-            match = LightGlueMatcher(read, kind, device=device).match
-        else:
-            nearest = Matcher(
-                lambda name: read(name).descriptors, device=device, block_size=config.block_size
-            )
-            match = nearest.match
+        match = create_matcher(config, read, kind, device=device)
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, Matches]]:
             return threaded(lambda pair: match(*pair), missing, count_threads(run.threads) if on_cpu else 1)

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from corrsfm.errors import CheckpointError
+from corrsfm.model.weights import fill_network
 
 __all__ = ["SuperPoint", "load_superpoint"]
 
@@ -143,24 +143,8 @@ def load_superpoint(path: Path) -> SuperPoint:
             f"{path}: cannot be read as weights ({type(error).__name__}); {advice}"
         ) from error
     state = state.get("state_dict", state) if isinstance(state, Mapping) else state
-    network = SuperPoint()
-    problems = _differences(network.state_dict(), state)
-    if problems:
-        raise CheckpointError(f"{path}: {'; '.join(problems)}; {advice}")
-    network.load_state_dict(state)
-    return network.eval()
-
-
-def _differences(own: Mapping[str, Tensor], state: Any) -> list[str]:
     if not isinstance(state, Mapping):
-        return [f"holds a {type(state).__name__}"]
-    problems = []
-    if missing := sorted(own.keys() - state.keys()):
-        problems.append(f"lacks {', '.join(missing[:4])}" + (" …" if len(missing) > 4 else ""))
-    if unexpected := sorted(map(str, state.keys() - own.keys())):
-        problems.append(f"also holds {', '.join(unexpected[:4])}" + (" …" if len(unexpected) > 4 else ""))
-    for name in sorted(own.keys() & state.keys()):
-        shape = tuple(getattr(state[name], "shape", ()))
-        if shape != tuple(own[name].shape):
-            problems.append(f"{name} has shape {shape}, expected {tuple(own[name].shape)}")
-    return problems
+        raise CheckpointError(f"{path}: holds a {type(state).__name__}; {advice}")
+    network = SuperPoint()
+    fill_network(network, state, f"{path}: not the weights of SuperPoint ({advice})")
+    return network.eval()

@@ -48,6 +48,7 @@ __all__ = [
     "BundledCheckpoint",
     "build_network",
     "checkpoint_sha256",
+    "fill_network",
     "load_network",
     "read_provenance",
     "save_network",
@@ -210,7 +211,7 @@ def load_network(
         raise CheckpointError(
             f"{file}: holds the network {found}, expected {architecture}; --method {found} reads it"
         )
-    _fill(network.to(map_location), state, f"{file}: not a checkpoint of this network ({found})")
+    fill_network(network.to(map_location), state, f"{file}: not a checkpoint of this network ({found})")
     if "usage" in content:
         network.usage = _read_usage(content["usage"], file)
     return network.eval()
@@ -362,8 +363,22 @@ def _read_usage(values: Any, file: Path) -> NetworkUsage:
         raise CheckpointError(str(error)) from error
 
 
-def _fill(network: nn.Module, state: Mapping[str, Any], complaint: str) -> None:
-    """Copy a state dict into a network; names and shapes must match exactly."""
+def fill_network(network: nn.Module, state: Mapping[str, Any], complaint: str) -> None:
+    """Copy a state dict into a network; names and shapes must match exactly.
+
+    Parameters
+    ----------
+    network : Module
+    state : mapping
+        As it was read from a file: names to whatever was stored.
+    complaint : str
+        Begins the message if it does not fit.
+
+    Raises
+    ------
+    CheckpointError
+        Naming every difference.
+    """
     own = network.state_dict()
     problems = []
     for title, names in [("missing", own.keys() - state.keys()), ("unexpected", state.keys() - own.keys())]:

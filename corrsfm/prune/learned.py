@@ -340,14 +340,16 @@ class Pruner:
             share = float(np.mean(pair.ratios > _GUARD_RATIO))
             if share < _GUARD_MIN_SHARE or (reads_all and pair.mutual.all()):
                 self._warned = True
+                why = (
+                    f"{share:.0%} have a ratio over {_GUARD_RATIO}, {np.mean(pair.mutual):.0%} are mutual"
+                    if pair.scores is None
+                    else "a matcher or another tool chose them"
+                )
                 logger.warning(
-                    "%s: these matches look filtered already (%.0f %% have a ratio over %.1f, %.0f %% are "
-                    "mutual); the network is trained on %s nearest neighbours and may do harm here; "
-                    "try --method loransac",
+                    "%s: these matches look filtered already (%s); the network is trained on %s nearest "
+                    "neighbours and may do harm here; try --method loransac",
                     pair.name,
-                    100 * share,
-                    _GUARD_RATIO,
-                    100 * float(np.mean(pair.mutual)),
+                    why,
                     "all" if reads_all else "all mutual",
                 )
                 return

@@ -14,6 +14,10 @@
     ├── registration.py  photos in the wrong place, registered again
     ├── folds/           models folded by repeated structure
     ├── verdict.py       good, doubtful or wrong; record.py keeps why
-    ├── calibration.py   implausible focal lengths
+    ├── calibration.py   implausible focal lengths, and adjusting a model
+    ├── lens.py          what a richer lens model would gain; focal_slack.py what other focal lengths cost
+    ├── joining.py       several models become one; same_points.py and similarity.py find how they lie
+    ├── growth.py        a finished model gets more photos; resection.py finds their poses
+    ├── cache.py         the database, for going on with finished models
     └── failure.py       why there is no model
 """

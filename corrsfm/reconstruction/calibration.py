@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 __all__ = [
     "adjust",
     "adjusted_cost",
+    "adjustment_options",
     "describe_impossible",
     "focal_length_ratios",
     "has_possible_cameras",
@@ -113,10 +114,28 @@ def refine_intrinsics(
     num_threads : int
         0 for all cores.
     """
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point = refine_principal_point
-    options.ceres.solver_options.num_threads = num_threads or -1
+    options = adjustment_options(principal_point=refine_principal_point, num_threads=num_threads)
     refine(model, options)
+
+
+def adjustment_options(
+    *, intrinsics: bool = True, principal_point: bool = False, num_threads: int = 1
+) -> pycolmap.BundleAdjustmentOptions:
+    """How a whole model is adjusted: what mapping left alone stays.
+
+    Parameters
+    ----------
+    intrinsics : bool
+        Whether focal lengths and distortion may change.
+    principal_point : bool
+    num_threads : int
+        0 for all cores.
+    """
+    options = pycolmap.BundleAdjustmentOptions()
+    options.refine_focal_length = options.refine_extra_params = intrinsics
+    options.refine_principal_point = principal_point
+    options.ceres.solver_options.num_threads = num_threads or -1
+    return options
 
 
 def refine(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> None:

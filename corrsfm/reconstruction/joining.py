@@ -9,7 +9,7 @@ if it explains and predicts what its parts did.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,25 +18,22 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_points
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.cache import load_cache
-from corrsfm.reconstruction.calibration import has_possible_cameras, refine
+from corrsfm.reconstruction.calibration import adjustment_options, has_possible_cameras, refine
 from corrsfm.reconstruction.folds.unfold import judge_model
-from corrsfm.reconstruction.predicted import nearest_descriptors
 from corrsfm.reconstruction.resection import Landmarks
-from corrsfm.reconstruction.similarity import Observed, Similarity, find_similarity
+from corrsfm.reconstruction.same_points import candidates_of, observed, registered_images
+from corrsfm.reconstruction.similarity import Similarity, find_similarity
 from corrsfm.reconstruction.views import views_of
-from corrsfm.types import Features, Pair
+from corrsfm.types import Pair
 
 __all__ = ["Joining", "join_models"]
 
 FEWEST_POINTS = 15
 """Points that must agree with one similarity. By chance up to 8 do."""
 _MAX_ERROR_SHARE, _LEAST_ERROR_PX = 0.01, 4.0
-_MAX_POINTS = 20_000
 _MAX_ATTEMPTS = 12
 # Adjusting the whole moves a few matches over a threshold.
 _LEAST_EXPLAINED, _LEAST_PREDICTED = 0.99, 0.97
@@ -113,7 +110,8 @@ def join_models(
     Returns
     -------
     models : list of pycolmap.Reconstruction
-        Those that are left; a joined model stands in the place of its larger part.
+        Those that are left; a joined model stands in the place of its larger part, or before models that are
+        smaller than it.
     attempts : list of Joining
         In the order of trying.
 
@@ -122,10 +120,9 @@ def join_models(
     DatabaseError
         If the database cannot be read.
     """
-    options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = refine_intrinsics
-    options.refine_principal_point = refine_principal_point
-    options.ceres.solver_options.num_threads = num_threads
+    options = adjustment_options(
+        intrinsics=refine_intrinsics, principal_point=refine_principal_point, num_threads=num_threads
+    )
     left = list(models)
     attempts: list[Joining] = []
     tried: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
@@ -147,8 +144,9 @@ def join_models(
         joined, attempt = _join(left[i], left[j], database, evidence, options, seed)
         attempts.append(attempt)
         if joined is not None:
-            left[i] = joined
-            del left[j]
+            del left[j], left[i]
+            smaller = (k for k in range(i) if left[k].num_reg_images() < joined.num_reg_images())
+            left.insert(next(smaller, i), joined)
     return left, attempts
 
 
@@ -160,8 +158,8 @@ def _join(
     options: pycolmap.BundleAdjustmentOptions,
     seed: int,
 ) -> tuple[pycolmap.Reconstruction | None, Joining]:
-    candidates = _candidates(a, b, database, evidence.features)
-    side_a, side_b = (_observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
+    candidates = candidates_of(a, b, database, evidence.features)
+    side_a, side_b = (observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
     longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
     max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
     found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
@@ -193,151 +191,6 @@ def _join(
     return joined, outcome(f"{len(same)} points agree on how they lie to one another", joined=True)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Candidates:
-    """Observations that may be of the same point: (image id, keypoint, point id) a row, of either model."""
-
-    a: NDArray[np.int64]
-    b: NDArray[np.int64]
-
-    def same_points(self, chosen: NDArray[np.bool_]) -> list[tuple[int, int]]:
-        """Distinct pairs of point ids among chosen rows, each point once, those with most rows first."""
-        pairs, counts = np.unique(
-            np.column_stack([self.a[chosen, 2], self.b[chosen, 2]]), axis=0, return_counts=True
-        )
-        taken_a: set[int] = set()
-        taken_b: set[int] = set()
-        same = []
-        for row in np.argsort(-counts, kind="stable"):
-            point_a, point_b = (int(value) for value in pairs[row])
-            if point_a not in taken_a and point_b not in taken_b:
-                taken_a.add(point_a)
-                taken_b.add(point_b)
-                same.append((point_a, point_b))
-        return same
-
-
-def _candidates(
-    a: pycolmap.Reconstruction,
-    b: pycolmap.Reconstruction,
-    database: Path,
-    load: Callable[[str], Features],
-) -> _Candidates:
-    rows = [
-        *_by_common_photos(a, b),
-        *_by_kept_matches(a, b, database),
-        *_by_looks(a, b, load),
-    ]
-    unique = np.unique(np.array(rows, np.int64).reshape(-1, 6), axis=0)
-    return _Candidates(a=unique[:, :3], b=unique[:, 3:])
-
-
-def _registered(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
-    return {image.name: image for image in model.images.values() if image.has_pose}
-
-
-def _by_common_photos(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> list[tuple[int, ...]]:
-    """Keypoints of photos in both models that see a point in both."""
-    landmarks_a, landmarks_b = Landmarks(a), Landmarks(b)
-    images_a, images_b = _registered(a), _registered(b)
-    rows: list[tuple[int, ...]] = []
-    for name in sorted(images_a.keys() & images_b.keys()):
-        points_a, points_b = landmarks_a.of_keypoints(name), landmarks_b.of_keypoints(name)
-        for k in np.flatnonzero((points_a >= 0) & (points_b >= 0)):
-            image_a, image_b = images_a[name].image_id, images_b[name].image_id
-            rows.append((image_a, int(k), int(points_a[k]), image_b, int(k), int(points_b[k])))
-    return rows
-
-
-def _by_kept_matches(
-    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, database: Path
-) -> list[tuple[int, ...]]:
-    """Kept matches between a photo of either model, whether or not the pair was verified."""
-    ids_a = {image.image_id: name for name, image in _registered(a).items()}
-    ids_b = {image.image_id: name for name, image in _registered(b).items()}
-    landmarks_a, landmarks_b = Landmarks(a), Landmarks(b)
-    rows: list[tuple[int, ...]] = []
-    with colmap_log(), database_errors(database), pycolmap.Database.open(database) as tables:
-        for pair_id in sorted(tables.read_num_matches()[0]):
-            id0, id1 = pycolmap.pair_id_to_image_pair(pair_id)
-            for first, second, columns in ((id0, id1, (0, 1)), (id1, id0, (1, 0))):
-                if first not in ids_a or second not in ids_b or first in ids_b or second in ids_a:
-                    continue
-                matches = np.asarray(tables.read_matches(id0, id1), np.int64)[:, columns]
-                points_a = landmarks_a.of_keypoints(ids_a[first])[matches[:, 0]]
-                points_b = landmarks_b.of_keypoints(ids_b[second])[matches[:, 1]]
-                for row in np.flatnonzero((points_a >= 0) & (points_b >= 0)):
-                    rows.append(
-                        (
-                            first,
-                            int(matches[row, 0]),
-                            int(points_a[row]),
-                            second,
-                            int(matches[row, 1]),
-                            int(points_b[row]),
-                        )
-                    )
-    return rows
-
-
-def _by_looks(
-    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, load: Callable[[str], Features]
-) -> list[tuple[int, ...]]:
-    """Points of either model whose descriptors are nearest to each other and clearly nearer than the next."""
-    rows_a, descriptors_a = _described(a, load)
-    rows_b, descriptors_b = _described(b, load)
-    forward, backward = _nearest(descriptors_a, descriptors_b), _nearest(descriptors_b, descriptors_a)
-    return [(*rows_a[i], *rows_b[j]) for i, j in sorted(forward.items()) if backward.get(j) == i]
-
-
-def _nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> dict[int, int]:
-    """Row of a → its nearest row of b, where it passes the ratio test against the second."""
-    if len(a) == 0 or len(b) < 2:
-        return {}
-    found = nearest_descriptors(a, b, num=2)
-    return {int(row): int(index) for row, index in zip(found.keypoints, found.indices[:, 0], strict=True)}
-
-
-def _described(
-    model: pycolmap.Reconstruction, load: Callable[[str], Features]
-) -> tuple[list[tuple[int, int, int]], NDArray[np.uint8]]:
-    """An observation (image id, keypoint, point id) of each point, long tracks first, and its look."""
-    ranked = sorted(model.points3D.items(), key=lambda item: (-item[1].track.length(), item[0]))
-    rows = []
-    for point_id, point in ranked[:_MAX_POINTS]:
-        first = min(point.track.elements, key=lambda element: (element.image_id, element.point2D_idx))
-        rows.append((int(first.image_id), int(first.point2D_idx), int(point_id)))
-    by_image: dict[int, list[int]] = defaultdict(list)
-    for number, row in enumerate(rows):
-        by_image[row[0]].append(number)
-    descriptors = np.zeros((0, 128), np.uint8)
-    for image_id, numbers in sorted(by_image.items()):
-        own = load(model.images[image_id].name).descriptors
-        if len(descriptors) == 0:
-            descriptors = np.zeros((len(rows), own.shape[1]), np.uint8)
-        descriptors[numbers] = own[[rows[number][1] for number in numbers]]
-    return rows, descriptors
-
-
-def _observed(model: pycolmap.Reconstruction, rows: NDArray[np.int64]) -> Observed:
-    num = len(rows)
-    rotations, translations = np.zeros((num, 3, 3)), np.zeros((num, 3))
-    rays, focal_px = np.zeros((num, 2)), np.zeros(num)
-    for image_id in np.unique(rows[:, 0]):
-        image = model.images[int(image_id)]
-        here = rows[:, 0] == image_id
-        pose = image.cam_from_world()
-        rotations[here], translations[here] = pose.rotation.matrix(), pose.translation
-        pixels = np.array([image.points2D[int(k)].xy for k in rows[here, 1]])
-        camera = model.cameras[image.camera_id]
-        rays[here] = normalise_points(camera_from_pycolmap(camera), pixels)
-        focal_px[here] = camera.mean_focal_length()
-    points = np.array([model.points3D[int(i)].xyz for i in rows[:, 2]]).reshape(-1, 3)
-    return Observed(
-        points=points, rotations=rotations, translations=translations, rays=rays, focal_px=focal_px
-    )
-
-
 def _merged(
     a: pycolmap.Reconstruction,
     b: pycolmap.Reconstruction,
@@ -348,7 +201,7 @@ def _merged(
 ) -> pycolmap.Reconstruction:
     """Model a with the photos and points that only b has, brought into the frame of a."""
     merged = pycolmap.Reconstruction(a)
-    in_a, in_b = _registered(a), _registered(b)
+    in_a, in_b = registered_images(a), registered_images(b)
     moved = pycolmap.Reconstruction(b)
     moved.transform(
         pycolmap.Sim3d(a_from_b.scale, pycolmap.Rotation3d(a_from_b.rotation), a_from_b.translation)
@@ -406,7 +259,7 @@ def _across(
     a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, matches: Mapping[Pair, NDArray[np.int32]]
 ) -> dict[Pair, NDArray[np.int32]]:
     """Those matches that are of pairs which neither model holds."""
-    in_a, in_b = _registered(a).keys(), _registered(b).keys()
+    in_a, in_b = registered_images(a).keys(), registered_images(b).keys()
     return {pair: m for pair, m in matches.items() if not (in_a >= set(pair) or in_b >= set(pair))}
 
 

@@ -23,7 +23,7 @@ from corrsfm.reconstruction.calibration import has_possible_cameras, is_plausibl
 from corrsfm.reconstruction.failure import read_pair_graph, why_no_model
 from corrsfm.types import ModelSummary
 
-__all__ = ["reconstruct"]
+__all__ = ["reconstruct", "threads_for"]
 
 _POLL_SECONDS = 0.2
 
@@ -106,7 +106,7 @@ def reconstruct(
             images_dir or scratch,
             scratch,
             config=config,
-            options=_incremental_options(config, output, seed, _threads_for(len(graph.names), num_threads)),
+            options=_incremental_options(config, output, seed, threads_for(len(graph.names), num_threads)),
             on_progress=on_progress or (lambda num_registered: None),
         )
         seconds = time.monotonic() - started
@@ -132,8 +132,8 @@ def reconstruct(
         return [summarise_model(model) for model in models]
 
 
-def _threads_for(num_photos: int, num_threads: int) -> int:
-    """Threads of the mapper: one where several would make it a draw."""
+def threads_for(num_photos: int, num_threads: int) -> int:
+    """Threads to map a scene on: one where several would make it a draw; 0 for all cores stays 0."""
     return 1 if num_photos <= _MOST_PHOTOS_ON_ONE_THREAD else num_threads
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import shlex
 import shutil
 import time
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, pol
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mapper import reconstruct as map_database
+from corrsfm.reconstruction.mapper import threads_for
 from corrsfm.reconstruction.record import record_of
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
@@ -121,7 +123,7 @@ def _keep_grown_models(workspace: Workspace) -> None:
         logger.warning(
             "an addition of photos was not finished; all photos are mapped again instead, and every pose "
             "moves; to finish it instead, stop and run: corrsfm add %s",
-            workspace.root,
+            shlex.quote(str(workspace.root)),
         )
     added = read_added(workspace)
     if not added or not workspace.sparse.is_dir():
@@ -207,7 +209,7 @@ class _Choice:
             seed=self._run.seed,
             refine_intrinsics=self._config.refine_intrinsics,
             refine_principal_point=self._config.refine_principal_point,
-            num_threads=count_threads(self._run.threads),
+            num_threads=threads_for(len(self._names), count_threads(self._run.threads)),
         )
         for attempt in attempts:
             logger.info("%s", attempt)

@@ -401,16 +401,17 @@ class Workspace:
         """Remember that mapping failed, and move the models of earlier matches out of the way.
 
         They go to ``sparse.old``, with the reports about them, so that they are not mistaken for new ones,
-        and replace what was moved there before.
+        and replace what was moved there before. An addition to them can no longer be finished.
         """
         self.forget("models")
+        self.adding.unlink(missing_ok=True)
         if verified := self.record_of("verified matches"):
             self._values["mapping_failed"] = verified.fingerprint
             atomic_write_json(self.manifest, self._values)
         if not self.sparse.is_dir():
             self.run_json.unlink(missing_ok=True)
             return
-        for path in (self.run_json, self.evidence, self.report_json, self.report_html):
+        for path in (self.run_json, self.evidence, self.added, self.report_json, self.report_html):
             if path.exists():
                 os.replace(path, self.sparse / path.name)
         aside = self.sparse.with_name("sparse.old")

@@ -17,6 +17,7 @@ from scene_to_grow import SceneToGrow, contents, make_scene_to_grow
 
 import corrsfm.features.stage
 import corrsfm.finished.add as adding
+import corrsfm.finished.grown_models as grown_models
 from corrsfm import config as cfg
 from corrsfm.colmap.models import poses_of
 from corrsfm.errors import CorrsfmError, ImageError, InputError, WorkspaceError
@@ -171,7 +172,7 @@ def test_an_interrupted_addition_goes_on_where_it_was(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(adding, step, interrupt)
+        patch.setattr(grown_models if hasattr(grown_models, step) else adding, step, interrupt)
         add_photos(scene.workspace, scene.new, run=RUN)
     if step != "report":
         with pytest.raises(WorkspaceError, match="run: corrsfm add"):
@@ -190,7 +191,7 @@ def test_an_interruption_while_models_are_replaced_loses_none(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(adding, "grow", interrupt)
+        patch.setattr(grown_models, "grow", interrupt)
         add_photos(scene.workspace, scene.new, run=RUN)
     (scene.workspace / "sparse").rename(scene.workspace / ".sparse.old")
     result = add_photos(scene.workspace, run=RUN)

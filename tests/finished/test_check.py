@@ -20,7 +20,9 @@ from corrsfm.workspace import StageRecord, Workspace
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> FinishedScene:
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FinishedScene:
+    # What a made scene lacks of a real one is no damage.
+    monkeypatch.setattr(checking, "find_damage", lambda _: [])
     made = make_finished_scene(tmp_path / "made", camera="SIMPLE_RADIAL")
     workspace = Workspace(made.workspace)
     for stage in ("images", "features", "pairs", "matches", "pruned matches", "verified matches"):

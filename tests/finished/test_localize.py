@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -11,18 +12,21 @@ import numpy as np
 import pycolmap
 import pytest
 from click.testing import CliRunner
+from numpy.typing import NDArray
 from rendered_scene import CONFIG
 from scene_to_grow import SceneToGrow, contents, make_scene_to_grow
 from sift_as_network import install_sift_as_aliked
 
 from corrsfm.cli import main
 from corrsfm.colmap.models import poses_of
-from corrsfm.config import Extractor, PruneConfig, PruneMethod
+from corrsfm.config import Extractor, FeaturesConfig, PruneConfig, PruneMethod
 from corrsfm.errors import ConfigError, DependencyError, ImageError, InputError, WorkspaceError
+from corrsfm.features import create_extractor
 from corrsfm.finished.add import add_photos
 from corrsfm.finished.localize import CSV_COLUMNS, localize
 from corrsfm.geometry import relative_pose, rotation_angle_deg
 from corrsfm.pipeline import run_scene
+from corrsfm.types import Features
 from corrsfm.workspace import Workspace
 
 RUN = CONFIG.run
@@ -55,6 +59,18 @@ def test_photos_are_located_and_the_workspace_stays_as_it_is(scene: SceneToGrow)
 
 def test_the_same_photos_are_located_at_the_same_places(scene: SceneToGrow) -> None:
     assert localize(scene.workspace, scene.new, run=RUN) == localize(scene.workspace, scene.new, run=RUN)
+
+
+def test_a_network_that_reads_colour_gets_photos_in_colour(
+    scene: SceneToGrow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def in_colour(config: FeaturesConfig, device: str) -> Callable[[NDArray, None], Features]:
+        extract = create_extractor(config, device)
+        return lambda photo, mask: extract(np.asarray(cv2.cvtColor(photo, cv2.COLOR_BGR2GRAY)), mask)
+
+    monkeypatch.setattr("corrsfm.finished.localize.create_extractor", in_colour)
+    monkeypatch.setattr("corrsfm.finished.localize.reads_colour", lambda extractor: True)
+    assert localize(scene.workspace, scene.new, run=RUN).num_located == 2
 
 
 def test_known_intrinsics_are_used_as_they_are(scene: SceneToGrow) -> None:

@@ -1,6 +1,7 @@
 """Phones' and cameras' formats: HEIC, AVIF, 16-bit TIFF and turned photos, from the file to an export."""
 
 import dataclasses
+import json
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from corrsfm import check_photos, export_scene, pipeline
 from corrsfm import config as cfg
 from corrsfm.cli import main
 from corrsfm.errors import DependencyError, ImageError, InputError, WorkspaceError
+from corrsfm.files import OWN_RECORD
 from corrsfm.images.convert import possible_originals, readable_copies, readable_name
 from corrsfm.images.photos import convert_photo, read_colour, read_image, read_photo_info
 from corrsfm.workspace import Workspace
@@ -231,6 +233,31 @@ def test_files_of_others_are_not_replaced_by_copies(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="holds files of others"):
         readable_copies(tmp_path, ["a.heic"], tmp_path / "converted", str)
     assert (tmp_path / "converted" / "a.jpg").read_bytes() == b"mine"
+
+
+def test_a_record_of_copies_that_leads_out_of_the_folder_removes_nothing(tmp_path: Path) -> None:
+    precious = tmp_path / "precious.jpg"
+    precious.write_bytes(b"mine")
+    folder = tmp_path / "scene" / "converted"
+    folder.mkdir(parents=True)
+    gone = folder / "gone.jpg"
+    gone.write_bytes(b"a copy")
+    record = {"../../precious.jpg": "", str(precious): "", "gone.jpg": ""}
+    (folder / OWN_RECORD).write_text(json.dumps(record), encoding="utf-8")
+    readable_copies(tmp_path, ["precious.jpg"], folder, str)
+    assert precious.read_bytes() == b"mine" and not gone.exists()
+
+
+@pytest.mark.parametrize("name", ["a.avif", "a.heic"])
+def test_what_is_no_photo_is_not_decoded_whatever_its_suffix(tmp_path: Path, name: str) -> None:
+    image_module = pytest.importorskip("PIL.Image")
+    pytest.importorskip("PIL.AvifImagePlugin" if name == "a.avif" else "pillow_heif")
+    # Pillow would hand PostScript to another program.
+    image_module.fromarray(picture()).save(tmp_path / name, format="EPS")
+    with pytest.raises(ImageError, match="no photo"):
+        read_image(tmp_path / name)
+    image_module.fromarray(picture()).save(tmp_path / name, format="JPEG")
+    assert read_image(tmp_path / name).shape == picture().shape
 
 
 def test_names_of_copies() -> None:

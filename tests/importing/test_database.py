@@ -49,6 +49,15 @@ def test_sift_of_an_old_database_comes_in_with_its_matches(
     assert command.endswith(f"--database {path} --kind sift")
 
 
+def test_a_database_in_a_folder_with_an_odd_name_is_read(
+    photos: Path, names: list[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "50% of #2?"
+    folder.mkdir()
+    write_old_database(folder / "database.db", names)
+    assert import_features(photos, tmp_path / "scene", database=folder / "database.db").num_pairs == 1
+
+
 def test_matches_may_be_left(photos: Path, names: list[str], tmp_path: Path) -> None:
     write_old_database(tmp_path / "database.db", names)
     result = import_features(

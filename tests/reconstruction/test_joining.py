@@ -47,8 +47,12 @@ def test_few_matches_of_each_pair_are_enough_together(tmp_path: Path) -> None:
     assert_joined_as_it_was(parts)
 
 
-def test_without_any_match_the_look_of_points_is_enough(tmp_path: Path) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60, num_cross_matches=0)
+@pytest.mark.parametrize("unit_descriptors", [False, True])
+def test_without_any_match_the_look_of_points_is_enough(unit_descriptors: bool, tmp_path: Path) -> None:
+    parts = make_two_parts(
+        tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60, num_cross_matches=0,
+        unit_descriptors=unit_descriptors,
+    )  # fmt: skip
     assert_joined_as_it_was(parts)
 
 
@@ -108,6 +112,18 @@ def test_models_that_share_photos_are_joined_by_them(tmp_path: Path) -> None:
     models, (attempt,) = join_models([first, second], parts.database, parts.evidence)
     assert attempt.is_joined and len(models) == 1
     assert relative_pose_differences_deg(views_of(models[0]), views_of(parts.truth)).max() < 0.6
+
+
+def test_a_joined_model_that_is_larger_than_the_first_takes_its_place(tmp_path: Path) -> None:
+    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    # Without points nothing can join it.
+    empty = pycolmap.Reconstruction(parts.models[0])
+    empty.deregister_frame(empty.find_image_with_name("a4.jpg").frame_id)
+    for point_id in list(empty.points3D):
+        empty.delete_point3D(point_id)
+    models, attempts = join_models([empty, *parts.models], parts.database, parts.evidence)
+    assert [model.num_reg_images() for model in models] == [10, 4]
+    assert [attempt.is_joined for attempt in attempts] == [False, False, True, False]
 
 
 def test_the_mapper_hands_its_models_on_to_be_joined(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from corrsfm.colmap.models import observation_errors, read_models, summarise_mod
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.errors import DatabaseError, ReconstructionError, WorkspaceError
 from corrsfm.reconstruction import mapper as reconstruction
-from corrsfm.reconstruction.mapper import _ranked, _threads_for, reconstruct
+from corrsfm.reconstruction.mapper import _ranked, reconstruct, threads_for
 
 MODEL_FILES = ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"]
 
@@ -166,8 +166,8 @@ def test_few_verified_matches_are_enough_once_verified(tmp_path: Path) -> None:
 
 
 def test_only_large_scenes_are_mapped_on_many_threads() -> None:
-    assert [_threads_for(num, 8) for num in (2, 200, 201)] == [1, 1, 8]
-    assert _threads_for(1000, 0) == 0
+    assert [threads_for(num, 8) for num in (2, 200, 201)] == [1, 1, 8]
+    assert threads_for(1000, 0) == 0
 
 
 @pytest.mark.parametrize("mapper", list(Mapper))
@@ -208,7 +208,7 @@ def test_killed_mapping_leaves_no_models_and_the_next_run_succeeds(tmp_path: Pat
 import os
 from pathlib import Path
 from corrsfm.config import ReconstructionConfig
-from corrsfm.reconstruction.mapper import _ranked, _threads_for, reconstruct
+from corrsfm.reconstruction.mapper import _ranked, threads_for, reconstruct
 folder = Path({str(tmp_path)!r})
 reconstruct(folder / "database.db", None, folder / "sparse", config=ReconstructionConfig(),
             on_progress=lambda num: os._exit(9) if num == 6 else None)

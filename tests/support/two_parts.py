@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.descriptors import unit_rows
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.types import Features, Pair
 
@@ -41,6 +42,7 @@ def make_two_parts(
     num_cross_matches: int = 10,
     noise_px: float = 0.5,
     num_false_matches: int = 0,
+    unit_descriptors: bool = False,
 ) -> TwoParts:
     """Photos around a centre, in two groups that no verified pair connects.
 
@@ -57,6 +59,8 @@ def make_two_parts(
         True matches kept between a photo of either group, too few to be verified.
     num_false_matches : int
         False ones besides.
+    unit_descriptors : bool
+        Descriptors are unit vectors, as those of networks, not bytes.
     """
     generator = np.random.default_rng(5)
     points = generator.uniform(-1.0, 1.0, (num_common_points + 2 * num_own_points, 3))
@@ -86,7 +90,8 @@ def make_two_parts(
             ones = np.ones(len(order), np.float32)
             features[name] = Features(
                 keypoints=pixels.astype(np.float32), scales=ones, orientations=0 * ones, scores=ones,
-                descriptors=looks.astype(np.uint8), image_size=(WIDTH, HEIGHT),
+                descriptors=unit_rows(looks - 128) if unit_descriptors else looks.astype(np.uint8),
+                image_size=(WIDTH, HEIGHT),
             )  # fmt: skip
             image = pycolmap.Image(name=name, keypoints=pixels, camera_id=1, image_id=len(features))
             truth.add_image_with_trivial_frame(image, pose)

@@ -255,11 +255,14 @@ def test_models_put_aside_take_their_reports_along(workspace: Workspace) -> None
 
     make("first")
     workspace.report_html.write_text("first")
+    workspace.added.write_text("{}")
+    workspace.adding.write_text("{}")
     workspace.put_models_aside()
     aside = workspace.root / "sparse.old"
     assert workspace.record_of("models") is None
     assert not workspace.sparse.exists() and not workspace.run_json.exists()
-    assert sorted(path.name for path in aside.iterdir()) == ["0", "report.html", "run.json"]
+    assert not workspace.adding.exists()
+    assert sorted(path.name for path in aside.iterdir()) == ["0", "added.json", "report.html", "run.json"]
     workspace.put_models_aside()
     assert (aside / "run.json").read_text() == "first"
     make("second")
