@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from corrsfm import config as cfg
+from corrsfm.colmap.models import read_models
 from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
-from corrsfm.colmap.models import read_models
 from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
 from corrsfm.files import atomic_write_json
