@@ -208,4 +208,4 @@ def test_the_readmes_walk_through_works_on_a_sample_scene(repository: Path, tmp_
     assert (tmp_path / "scene" / "sparse" / "0" / "images.bin").exists()
     assert (tmp_path / "scene" / "report.html").exists()
     assert (tmp_path / "splat" / "sparse" / "0" / "cameras.bin").exists()
-    assert (tmp_path / "nerf" / "transforms.json").exists() and (tmp_path / "poses.csv").exists()
+    assert (tmp_path / "nerf" / "transforms.json").exists()
