@@ -7,7 +7,8 @@ is `pycolmap.geometric_verification`, which estimates geometries from the stored
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -74,8 +75,7 @@ def write_database(
         with colmap_log(), database_errors(temporary, path):
             _fill(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
-            max_error_px = config.verification_error_px or default_verification_error_px(cameras)
-            verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
+            _verify(temporary, cameras, config, seed, num_threads)
 
 
 def add_to_database(
@@ -115,11 +115,30 @@ def add_to_database(
     with atomic_path(path) as temporary:
         copy_database(path, temporary)
         with colmap_log(), database_errors(temporary, path):
-            sizes = _append(temporary, images, cameras, features, kept, config.write_descriptors)
+            all_cameras = _append(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
-            max_error_px = config.verification_error_px or default_verification_error_px(sizes)
             # Pairs that were verified before have a geometry, and those are passed over.
-            verify_pairs(temporary, config.min_num_inliers, max_error_px, seed, num_threads)
+            _verify(temporary, all_cameras, config, seed, num_threads)
+
+
+def _verify(
+    path: Path, cameras: Sequence[Camera], config: DatabaseConfig, seed: int, num_threads: int
+) -> None:
+    """Verify the pairs of a database that have no geometry yet."""
+    max_error_px = config.verification_error_px or default_verification_error_px(cameras)
+    verify_pairs(path, config.min_num_inliers, max_error_px, seed, num_threads)
+
+
+@contextlib.contextmanager
+def _transaction(path: Path) -> Iterator[pycolmap.Database]:
+    """A database to write into; COLMAP's verification opens it again, so it is closed behind the block."""
+    with pycolmap.Database.open(path) as database:
+        transaction = pycolmap.DatabaseTransaction(database)
+        try:
+            yield database
+        finally:
+            # The transaction ends when its object goes; the database must be open then.
+            del transaction
 
 
 def _append(
@@ -131,36 +150,32 @@ def _append(
     write_descriptors: bool,
 ) -> list[Camera]:
     """Write what is new; all cameras."""
-    with pycolmap.Database.open(path) as database:
-        transaction = pycolmap.DatabaseTransaction(database)
-        try:
-            image_ids = {image.name: image.image_id for image in database.read_all_images()}
-            for image in sorted(images, key=lambda image: image.name):
-                if image.name in image_ids:
-                    continue
-                camera_id, camera = cameras[image.name]
-                if not database.exists_camera(camera_id):
-                    write_camera(database, to_pycolmap(camera, camera_id), keep_id=True)
-                image_ids[image.name] = _write_image(database, image, camera_id)
-                _write_features(
-                    database, image_ids[image.name], image.name, features(image.name), write_descriptors
-                )
-            num_keypoints = {
-                name: database.num_keypoints_for_image(image_id) for name, image_id in image_ids.items()
-            }
-            _write_pairs(
-                database,
-                image_ids,
-                num_keypoints,
-                (
-                    (name0, name1, indices)
-                    for name0, name1, indices in kept
-                    if not database.exists_matches(image_ids[name0], image_ids[name1])
-                ),
+    with _transaction(path) as database:
+        image_ids = {image.name: image.image_id for image in database.read_all_images()}
+        for image in sorted(images, key=lambda image: image.name):
+            if image.name in image_ids:
+                continue
+            camera_id, camera = cameras[image.name]
+            if not database.exists_camera(camera_id):
+                write_camera(database, to_pycolmap(camera, camera_id), keep_id=True)
+            image_ids[image.name] = _write_image(database, image, camera_id)
+            _write_features(
+                database, image_ids[image.name], image.name, features(image.name), write_descriptors
             )
-            return [camera_from_pycolmap(camera) for camera in database.read_all_cameras()]
-        finally:
-            del transaction
+        num_keypoints = {
+            name: database.num_keypoints_for_image(image_id) for name, image_id in image_ids.items()
+        }
+        _write_pairs(
+            database,
+            image_ids,
+            num_keypoints,
+            (
+                (name0, name1, indices)
+                for name0, name1, indices in kept
+                if not database.exists_matches(image_ids[name0], image_ids[name1])
+            ),
+        )
+        return [camera_from_pycolmap(camera) for camera in database.read_all_cameras()]
 
 
 def _check_not_in_use(path: Path) -> None:
@@ -192,23 +207,17 @@ def _fill(
     write_descriptors: bool,
 ) -> None:
     """Write all tables but the geometries."""
-    # COLMAP's verification reads the file through another connection, so it has to be closed before.
-    with pycolmap.Database.open(path) as database:
-        transaction = pycolmap.DatabaseTransaction(database)
-        try:
-            camera_ids = [write_camera(database, to_pycolmap(camera)) for camera in cameras]
-            num_keypoints: dict[str, int] = {}
-            image_ids: dict[str, int] = {}
-            for image in sorted(images, key=lambda image: image.name):
-                image_id = _write_image(database, image, camera_ids[image.camera_id])
-                image_features = features(image.name)
-                _write_features(database, image_id, image.name, image_features, write_descriptors)
-                image_ids[image.name] = image_id
-                num_keypoints[image.name] = len(image_features)
-            _write_pairs(database, image_ids, num_keypoints, kept)
-        finally:
-            # The transaction ends when its object goes; the database must be open then.
-            del transaction
+    with _transaction(path) as database:
+        camera_ids = [write_camera(database, to_pycolmap(camera)) for camera in cameras]
+        num_keypoints: dict[str, int] = {}
+        image_ids: dict[str, int] = {}
+        for image in sorted(images, key=lambda image: image.name):
+            image_id = _write_image(database, image, camera_ids[image.camera_id])
+            image_features = features(image.name)
+            _write_features(database, image_id, image.name, image_features, write_descriptors)
+            image_ids[image.name] = image_id
+            num_keypoints[image.name] = len(image_features)
+        _write_pairs(database, image_ids, num_keypoints, kept)
 
 
 def _write_image(database: pycolmap.Database, image: ImageRecord, camera_id: int) -> int:
