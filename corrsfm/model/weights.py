@@ -84,6 +84,17 @@ class BundledCheckpoint:
     """Measured result, with the data it was measured on."""
 
 
+_SMALL = NetworkConfig(
+    channels=32,
+    clusters=48,
+    neighbors=(6, 3),
+    heads=2,
+    mlp_ratio=2,
+    motion_stacking=1,
+    oa_filters=1,
+    side_channels=5,
+)
+
 REGISTRY: dict[str, BundledCheckpoint] = {
     row.name: row
     for row in (
@@ -91,16 +102,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
             name="small-mutual",
             file="small-mutual.pt",
             sha256="9ce2716b19095a16a456d76b62b12687ebe1acb5c68963efa3b50cc26fc711c4",
-            config=NetworkConfig(
-                channels=32,
-                clusters=48,
-                neighbors=(6, 3),
-                heads=2,
-                mlp_ratio=2,
-                motion_stacking=1,
-                oa_filters=1,
-                side_channels=5,
-            ),
+            config=_SMALL,
             licence="Apache-2.0",
             training_data="5,873 pairs of 54 photo scenes with COLMAP poses; the model card names them",
             score="AUC@5° 75.0 against 69.2 of ratio + mutual, 240 validation pairs, 4,096 keypoints",
@@ -109,16 +111,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
             name="small-aliked",
             file="small-aliked.pt",
             sha256="c07c5a74c003691b98d90089bb75ef07c8b0c8ed2b99519e773ceae17859ca2e",
-            config=NetworkConfig(
-                channels=32,
-                clusters=48,
-                neighbors=(6, 3),
-                heads=2,
-                mlp_ratio=2,
-                motion_stacking=1,
-                oa_filters=1,
-                side_channels=2,
-            ),
+            config=dataclasses.replace(_SMALL, side_channels=2),
             licence="Apache-2.0",
             training_data="1,882 pairs of 54 photo scenes with COLMAP poses; the model card names them",
             score="AUC@5° 49.7 against 51.3 of mutual and 44.3 of ratio + mutual, 135 validation pairs",
