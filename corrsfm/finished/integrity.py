@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -68,23 +69,17 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             problem = f"damaged ({type(error).__name__}: {error})"
         else:
             continue
-        remove = shlex.join(["rm", "-r", *map(str, _names_of(path, workspace))])
-        remedy = (
-            f"{remove}; {command_again(workspace, stage)}"
-            if path.exists()
-            else command_again(workspace, stage)
-        )
+        remedy = command_again(workspace, stage)
+        if path.exists():
+            remedy = f"{shlex.join(['rm', '-r', *map(str, _names_of(path, workspace))])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return found
 
 
 def _names_of(path: Path, workspace: Workspace) -> list[Path]:
-    """All names of a file: that of a prune method's matches would bring the damage back."""
+    """All names of a file that is there: that of a prune method's matches would bring the damage back."""
     others = workspace.pruned_by("*")
-    same = [
-        other for other in sorted(others.parent.glob(others.name)) if path.exists() and path.samefile(other)
-    ]
-    return [path, *same]
+    return [path, *(other for other in sorted(others.parent.glob(others.name)) if path.samefile(other))]
 
 
 class _Reader:
@@ -110,15 +105,16 @@ class _Reader:
     def _images(self) -> None:
         read_index(self._workspace)
 
-    def _names(self) -> Iterator[str]:
+    @cached_property
+    def _names(self) -> tuple[str, ...]:
         try:
-            yield from read_index(self._workspace).names
+            return tuple(read_index(self._workspace).names)
         except CorrsfmError:  # a finding of its own
-            return
+            return ()
 
     def _features(self) -> None:
         with ItemStore(self._workspace.features, FEATURES).reader() as read:
-            for name in self._names():
+            for name in self._names:
                 features = read(name)
                 if not np.isfinite(features.keypoints).all():
                     raise WorkspaceError(f"{name}: keypoints that are not finite")
@@ -126,18 +122,19 @@ class _Reader:
                     raise WorkspaceError(f"{name}: not as many descriptors as keypoints")
                 self._num_keypoints[name] = len(features.keypoints)
 
-    def _known_pairs(self) -> Iterator[Pair]:
+    @cached_property
+    def _known_pairs(self) -> tuple[Pair, ...]:
         try:
-            yield from read_pairs(self._workspace).pairs
+            return read_pairs(self._workspace).pairs
         except CorrsfmError:  # a finding of its own
-            return
+            return ()
 
     def _pairs(self) -> None:
         if missing := [
             path for path in (self._workspace.pairs, self._workspace.pair_origins) if not path.exists()
         ]:
             raise WorkspaceError(f"{missing[0]}: missing")
-        names = set(self._names())
+        names = set(self._names)
         strange = {name for pair in read_pairs(self._workspace).pairs for name in pair} - names
         if strange and names:
             raise WorkspaceError(f"names {min(strange)}, which is no photo of the scene")
@@ -151,22 +148,16 @@ class _Reader:
             self._check_matches(read)
 
     def _check_matches(self, read: Callable[[Pair], Matches] | Callable[[Pair], PrunedMatches]) -> None:
-        for pair in self._known_pairs():
+        for pair in self._known_pairs:
             indices = read(pair).indices
             if indices.ndim != 2 or indices.shape[1] != 2:
                 raise WorkspaceError(f"{' – '.join(pair)}: matches of shape {indices.shape}")
-            self._check_range(pair, indices, self._num_keypoints)
-
-    @staticmethod
-    def _check_range(pair: Pair, indices: np.ndarray, num_keypoints: Mapping[str, int]) -> None:
-        for column, name in enumerate(pair):
-            num = num_keypoints.get(name)
-            if (
-                num is not None
-                and len(indices)
-                and not 0 <= indices[:, column].min() <= indices[:, column].max() < num
-            ):
-                raise WorkspaceError(f"{' – '.join(pair)}: matches of keypoints that {name} does not have")
+            for column, name in enumerate(pair):
+                # Where features are damaged, their number is not known.
+                num = self._num_keypoints.get(name, np.inf)
+                if not ((indices[:, column] >= 0) & (indices[:, column] < num)).all():
+                    where = " – ".join(pair)
+                    raise WorkspaceError(f"{where}: matches of keypoints that {name} does not have")
 
     def _database(self) -> None:
         with open_for_reading(self._workspace.database) as connection:
