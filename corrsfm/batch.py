@@ -2,31 +2,33 @@
 
 A scene that fails does not stop the others. Running the batch again resumes each scene where it stopped, as
 `corrsfm run` does. An interrupted batch ends the scenes on this machine; those that a Dask worker has begun
-run to their end.
+run to their end, and a later batch waits for them. A scene's process ends with the one that started it, so
+that a worker that was killed leaves nothing that holds the workspace.
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import itertools
-import json
 import logging
+import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
 
+from corrsfm.cluster import Cluster
 from corrsfm.config import load_pipeline
-from corrsfm.errors import DependencyError, InputError, WorkspaceError
+from corrsfm.errors import ClusterError, CorrsfmError, InputError, WorkspaceError
+from corrsfm.files import read_json
 from corrsfm.images.listing import holds_pictures
 from corrsfm.machine import count_threads
 
@@ -105,21 +107,35 @@ def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str,
     """
     if not collection.is_dir():
         raise InputError(f"{collection}: not a folder; expected one with a sub-folder for each scene")
-    other = leave_out.resolve() if leave_out is not None else None
     try:
-        folders = sorted(path for path in collection.iterdir() if path.is_dir())
+        folders = sorted(path for path in collection.iterdir() if _is_folder(path))
     except OSError as error:
         raise InputError(f"{collection}: cannot be read ({error.strerror}); check its permissions") from error
     scenes = {
         folder.name: _photos_of(folder)
         for folder in folders
-        if not folder.name.startswith(".") and folder.resolve() != other
+        if not folder.name.startswith(".") and not (leave_out is not None and _are_same(folder, leave_out))
     }
     if not scenes:
         raise InputError(
             f"{collection}: no sub-folders; expected one for each scene; for photos of one scene: corrsfm run"
         )
     return scenes
+
+
+def _is_folder(path: Path) -> bool:
+    try:
+        return path.is_dir()
+    except OSError:
+        # A link into a folder that may not be read.
+        return True
+
+
+def _are_same(folder: Path, other: Path) -> bool:
+    try:
+        return os.path.samefile(folder, other)
+    except OSError:
+        return False
 
 
 def _photos_of(scene: Path) -> Path:
@@ -168,44 +184,72 @@ def run_collection(
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise WorkspaceError(f"{output}: cannot be made ({error.strerror}); choose another folder") from error
-    statuses: list[SceneStatus] = []
-    processes = _Processes()
-    # Dask could not send the processes of this machine to a worker.
-    work: Callable[..., SceneStatus] = run_one
-    if dask is None:
-        work = functools.partial(run_one, call=processes.call)
     threads = _threads_argument(arguments, min(jobs, len(scenes))) if dask is None else []
-    waiting: dict[Future[SceneStatus], str] = {}
-    with _terminable(), _executor(jobs, dask) as executor:
-        try:
-            for scene, images in scenes.items():
-                places = str(images.resolve()), str((output / scene).resolve())
-                waiting[executor.submit(work, scene, *places, [*threads, *arguments])] = scene
-            with tqdm(total=len(waiting), desc="scenes", unit="scene") as bar:
-                pending = set(waiting)
-                logger.info("scenes to do: %d", len(pending))
-                while pending:
-                    # An unbounded wait can miss an interruption that comes just before it.
-                    done, pending = wait(pending, POLL_SECONDS, FIRST_COMPLETED)
-                    for future in done:
-                        statuses.append(_status_of(waiting[future], future))
-                        bar.update()
-                        logger.info("[%d/%d] %s", len(statuses), len(waiting), statuses[-1])
-        except BaseException:
-            for future in waiting:
-                future.cancel()
-            processes.end()
-            raise
+    tasks = [
+        # Not resolved: a link that leads nowhere is the trouble of its scene alone.
+        (scene, (scene, os.path.abspath(images), os.path.abspath(output / scene), [*threads, *arguments]))
+        for scene, images in scenes.items()
+    ]
+    statuses: list[SceneStatus] = []
+    with _terminable(), tqdm(total=len(tasks), desc="scenes", unit="scene") as bar:
+        logger.info("scenes to do: %d", len(tasks))
+        with contextlib.closing(_here(tasks, jobs) if dask is None else _on_dask(tasks, dask)) as outcomes:
+            for scene, outcome in outcomes:
+                statuses.append(_status_of(scene, outcome))
+                bar.update()
+                logger.info("[%d/%d] %s", len(statuses), len(tasks), statuses[-1])
     return sorted(statuses, key=lambda status: status.scene)
 
 
-def _status_of(scene: str, future: Future[SceneStatus]) -> SceneStatus:
+Task = tuple[str, tuple[str, str, str, list[str]]]
+"""A scene, and the arguments of `run_one`."""
+Outcomes = Generator[tuple[str, SceneStatus | Exception], None, None]
+
+
+def _here(tasks: Sequence[Task], jobs: int) -> Outcomes:
+    """Run scenes on this machine; those under way end when the caller wants no more."""
+    processes = _Processes()
+    with ThreadPoolExecutor(jobs) as executor:
+        waiting = {
+            executor.submit(run_one, *arguments, call=processes.call): scene for scene, arguments in tasks
+        }
+        try:
+            pending = set(waiting)
+            while pending:
+                # An unbounded wait can miss an interruption that comes just before it.
+                done, pending = wait(pending, POLL_SECONDS, FIRST_COMPLETED)
+                for future in done:
+                    error = future.exception()
+                    if error is not None and not isinstance(error, Exception):
+                        raise error
+                    yield waiting[future], error or future.result()
+        finally:
+            for future in waiting:
+                future.cancel()
+            processes.end()
+
+
+def _on_dask(tasks: Sequence[Task], address: str) -> Outcomes:
+    """Run scenes on the workers of a scheduler; if it is lost, so are the answers of all that is left."""
+    left = {scene for scene, _ in tasks}
+    with Cluster(address) as cluster:
+        try:
+            for scene, outcome in cluster.outcomes(run_one, tasks):
+                left.remove(scene)
+                yield scene, outcome
+        except ClusterError as error:
+            for scene in sorted(left):
+                yield scene, error
+
+
+def _status_of(scene: str, outcome: SceneStatus | Exception) -> SceneStatus:
     """How a scene ended, also where the process or the machine that ran it did."""
-    try:
-        return future.result()
-    except Exception as error:
-        message = f"Error: {type(error).__name__}: {error}; run the same command again"
-        return SceneStatus(scene=scene, succeeded=False, seconds=0.0, message=message)
+    if isinstance(outcome, SceneStatus):
+        return outcome
+    what = str(outcome)
+    if not isinstance(outcome, CorrsfmError):
+        what = f"{type(outcome).__name__}: {what}; run the same command again"
+    return SceneStatus(scene=scene, succeeded=False, seconds=0.0, message=f"Error: {what}")
 
 
 def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
@@ -234,11 +278,12 @@ class _Processes:
                 return -signal.SIGTERM
             process = subprocess.Popen(command, **streams)
             self._running.add(process)
-        try:
-            return process.wait()
-        finally:
-            with self._lock:
-                self._running.discard(process)
+        with process:
+            try:
+                return process.wait()
+            finally:
+                with self._lock:
+                    self._running.discard(process)
 
     def end(self) -> None:
         """Terminate all processes, and kill those that do not react."""
@@ -272,14 +317,9 @@ def _terminable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _executor(jobs: int, dask: str | None) -> Executor:
-    if dask is None:
-        return ThreadPoolExecutor(jobs)
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise DependencyError("distributed", "running scenes on a Dask cluster", "cluster") from error
-    return Client(dask).get_executor(pure=False)
+def _open_at_once(path: str, flags: int) -> int:
+    """Open a file; a pipe that nobody reads is refused in place of waited for."""
+    return os.open(path, flags | os.O_NONBLOCK, 0o666)
 
 
 def run_one(
@@ -295,13 +335,18 @@ def run_one(
     if not _lists_photos(arguments) and not holds_pictures(Path(images)):
         return SceneStatus(scene=scene, succeeded=False, empty=True, seconds=0.0, message="no photos")
     log = Path(f"{workspace}.{LOG_NAME}")
-    command = [sys.executable, "-m", "corrsfm", "--quiet", "run", images, workspace, *arguments]
+    command = [sys.executable, "-m", "corrsfm", "--quiet", "--attended", "run", images, workspace]
+    # A scene of a batch that was killed may still be ending.
+    command += ["--wait", *arguments]
     try:
-        with open(log, "w", encoding="utf-8") as handle:
-            code = call(command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL)
-        message = "" if code == 0 else _last_error(log) or f"ended with code {code}"
+        handle = open(log, "w", encoding="utf-8", opener=_open_at_once)  # noqa: SIM115
     except OSError as error:
         code, message = 1, f"Error: {log}: cannot be written ({error.strerror}); the scene was not run"
+    else:
+        with handle:
+            # The pipe closes with this process, and the scene's process ends.
+            code = call(command, stdout=handle, stderr=subprocess.STDOUT, stdin=subprocess.PIPE)
+        message = _why(code, log)
     summary = _summary(Path(workspace) / "report.json") if code == 0 else {}
     return SceneStatus(
         scene=scene,
@@ -318,6 +363,20 @@ def _lists_photos(arguments: Sequence[str]) -> bool:
     return any(argument.split("=")[0] in ("--image-list", "--pipeline") for argument in arguments)
 
 
+def _why(code: int, log: Path) -> str:
+    """Why a scene's process failed; empty if it did not."""
+    if code == 0:
+        return ""
+    if code > 0:
+        return _last_error(log) or f"ended with code {code}"
+    try:
+        name = signal.Signals(-code).name
+    except ValueError:
+        name = f"signal {-code}"
+    hint = ", as when memory runs out: give it fewer --threads, or the batch fewer --jobs"
+    return f"Error: killed ({name}{hint if -code == signal.SIGKILL else ''}); run the same command again"
+
+
 def _last_error(log: Path) -> str:
     """All lines of the last error in a log, or the last line if there is no error."""
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
@@ -328,6 +387,6 @@ def _last_error(log: Path) -> str:
 def _summary(report: Path) -> dict[str, Any]:
     """The summary of a report; empty if there is none."""
     try:
-        return dict(json.loads(report.read_text(encoding="utf-8"))["summary"])
+        return dict(read_json(report)["summary"])
     except (OSError, ValueError, KeyError, TypeError):
         return {}

@@ -40,7 +40,7 @@ def stand_in(root: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
 def test_an_interrupted_batch_ends_its_scenes_and_starts_no_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    stand_in(tmp_path, monkeypatch, 'echo $$ > "$6.pid"; exec sleep 60')
+    stand_in(tmp_path, monkeypatch, 'echo $$ > "$7.pid"; exec sleep 60')
     out = tmp_path / "out"
 
     def interrupt() -> None:
@@ -81,7 +81,7 @@ def test_scenes_at_a_time_share_the_cores_unless_told_otherwise(
     monkeypatch.chdir(tmp_path)
     Path("chosen.toml").write_text("[run]\nthreads = 3\n")
     Path("open.toml").write_text("[run]\nseed = 3\n")
-    stand_in(tmp_path, monkeypatch, 'shift 6; echo "$@" > "$0.$$"')
+    stand_in(tmp_path, monkeypatch, 'shift 8; echo "$@" > "$0.$$"')
     statuses = run_collection(collection(tmp_path, *"abc"), tmp_path / "out", arguments, jobs=jobs)
     assert [(status.scene, status.succeeded) for status in statuses] == [(s, True) for s in "abc"]
     assert [path.read_text().split() for path in tmp_path.glob("stand-in.*")] == [given] * 3
@@ -125,7 +125,7 @@ def test_without_an_error_the_message_is_what_there_is(
 def test_a_folder_without_photos_is_empty_and_no_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    stand_in(tmp_path, monkeypatch, 'echo "$6" >> "$0.called"')
+    stand_in(tmp_path, monkeypatch, 'echo "$7" >> "$0.called"')
     root = collection(tmp_path, "notes", "phone", "photos")
     (root / "notes" / "0.jpg").rename(root / "notes" / "0.txt")
     (root / "phone" / "0.jpg").rename(root / "phone" / "0.HEIC")
@@ -150,7 +150,7 @@ def test_a_folder_without_photos_is_empty_and_no_failure(
 def test_every_scene_that_ends_is_a_line_of_the_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stand_in(tmp_path, monkeypatch, 'test "${6%b}" = "$6"')
+    stand_in(tmp_path, monkeypatch, 'test "${7%b}" = "$7"')
     caplog.set_level("INFO", "corrsfm")
     run_collection(collection(tmp_path, *"ab"), tmp_path / "out")
     assert [" ".join(message.split()[:3]) for message in caplog.messages] == [
@@ -173,6 +173,69 @@ def test_what_befalls_a_scene_is_its_row_and_the_others_go_on(
     assert statuses[2].message.startswith("Error: ZeroDivisionError: ")
 
 
+def test_a_pipe_in_place_of_a_log_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    (tmp_path / "out").mkdir()
+    os.mkfifo(tmp_path / "out" / "a.batch.log")
+    statuses = run_collection(collection(tmp_path, *"ab"), tmp_path / "out")
+    assert [status.succeeded for status in statuses] == [False, True]
+    assert "a.batch.log: cannot be written (" in statuses[0].message
+
+
+def test_a_scene_that_was_killed_is_told_from_one_that_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch, "echo half a line; kill -9 $$")
+    root = collection(tmp_path, "a")
+    (status,) = run_collection(root, tmp_path / "out")
+    assert status.message.startswith("Error: killed (SIGKILL, as when memory runs out: ")
+    stand_in(tmp_path, monkeypatch, "kill -15 $$")
+    (status,) = run_collection(root, tmp_path / "out")
+    assert status.message == "Error: killed (SIGTERM); run the same command again"
+
+
+def test_a_scene_that_cannot_be_started_is_its_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
+    statuses = run_collection(collection(tmp_path, "a", "b"), tmp_path / "out")
+    assert [status.failed for status in statuses] == [True, True]
+    assert statuses[0].message.startswith("Error: FileNotFoundError: ")
+
+
+def test_links_that_lead_nowhere_end_no_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    root = collection(tmp_path, "a")
+    for name, target in (("loop", "loop"), ("dangling", "nowhere")):
+        (root / name).symlink_to(target)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").symlink_to("a")
+    statuses = run_collection(root, tmp_path / "out")
+    assert [(status.scene, status.succeeded) for status in statuses] == [("a", True)]
+
+
+def test_what_a_killed_batch_was_doing_ends_with_it_and_the_next_one_goes_on(tmp_path: Path) -> None:
+    write_photos(tmp_path / "collection" / "a", 4)
+    words = [str(tmp_path / "collection"), str(tmp_path / "out"), "--max-features", "500", "--device", "cpu"]
+    command = [sys.executable, "-m", "corrsfm", "batch", *words]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    lock, deadline = tmp_path / "out" / "a" / ".lock", time.monotonic() + 60
+    while not (lock.exists() and lock.stat().st_size) and time.monotonic() < deadline:
+        time.sleep(0.02)
+    holder = json.loads(lock.read_text())["process"]
+    process.kill()
+    process.wait()
+    while time.monotonic() < deadline:
+        try:
+            os.kill(holder, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.02)
+    else:
+        pytest.fail(f"process {holder} goes on")
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert " ok " in result.stdout
+
+
 def test_an_output_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "out").touch()
     with pytest.raises(WorkspaceError, match=r"out: cannot be made \(.*\); choose another folder"):
@@ -193,6 +256,38 @@ def test_workspaces_inside_the_collection_are_no_scene(tmp_path: Path) -> None:
     root = collection(tmp_path, "a", "out")
     assert list(find_scenes(root)) == ["a", "out"]
     assert list(find_scenes(root, leave_out=root / "a" / ".." / "out")) == ["a"]
+
+
+def stand_ins(root: Path, *names: str) -> dict[str, str]:
+    """An environment where commands write their names and arguments to `calls`."""
+    (root / "bin").mkdir()
+    for name in names:
+        script = root / "bin" / name
+        script.write_text(f'#!/bin/sh\necho {name} "$@" >> "{root}/calls"\n')
+        script.chmod(0o755)
+    return {"PATH": f"{root / 'bin'}:{os.environ['PATH']}", "SLURM_CPUS_PER_TASK": "8"}
+
+
+def test_a_slurm_job_of_one_scene_starts_workers_on_every_node(repository: Path, tmp_path: Path) -> None:
+    environment = stand_ins(tmp_path, "dask", "srun", "corrsfm", "hostname")
+    (tmp_path / "bin" / "hostname").write_text("#!/bin/sh\necho node1\n")
+    # When the run ends, so do scheduler and workers; on a busy machine they have not begun by then.
+    (tmp_path / "bin" / "corrsfm").write_text(
+        f'#!/bin/sh\nfor i in $(seq 200); do [ "$(wc -l < "{tmp_path}/calls")" -ge 2 ] && break; sleep 0.1; '
+        f'done\necho corrsfm "$@" >> "{tmp_path}/calls"\n'
+    )
+    subprocess.run(
+        ["bash", str(repository / "pipelines" / "scene.slurm"), "my photos", "out", "--method", "ratio"],
+        env=environment | {"SLURM_JOB_ID": "10007"}, check=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 20
+    while len(calls := (tmp_path / "calls").read_text().splitlines()) < 3 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert sorted(calls) == [
+        "corrsfm run my photos out --cluster tcp://node1:30007 --wait --method ratio",
+        "dask scheduler --port 30007 --no-dashboard",
+        "srun dask worker tcp://node1:30007 --nthreads 8 --memory-limit 0 --no-dashboard",
+    ]
 
 
 def test_a_job_of_the_slurm_array_runs_the_scene_of_its_number(repository: Path, tmp_path: Path) -> None:
@@ -222,5 +317,5 @@ def test_a_job_of_the_slurm_array_runs_the_scene_of_its_number(repository: Path,
         check=True,
     )
     assert result.stdout.splitlines() == [
-        "run", "collection/b c/images", "out/b c", "--threads", "8", "--method", "ratio",
+        "run", "collection/b c/images", "out/b c", "--threads", "8", "--wait", "--method", "ratio",
     ]  # fmt: skip

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
-from corrsfm.cli.options import OVERWRITE_KEY, echo_json, json_option
+from corrsfm.cli.options import OVERWRITE_KEY, PATH, echo_json, json_option
 
 __all__ = ["batch"]
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
-@click.argument("collection", type=click.Path(path_type=Path))
-@click.argument("output", type=click.Path(path_type=Path))
+@click.argument("collection", type=PATH)
+@click.argument("output", type=PATH)
 @click.argument("run_arguments", nargs=-1, type=click.UNPROCESSED)
 @click.option(
     "--jobs",
