@@ -5,8 +5,8 @@
 #   tools/rivals.sh measure [NAME…]   relative poses of pairs/val.h5 into results/rivals_pose.json
 #
 # Without names: all of them. pairs/ holds what `corrsfm train prepare` makes, see the recipes. A run that was
-# stopped goes on where it was, and what is measured already is not measured again. The minutes are those of a
-# clock: leave the machine alone meanwhile, or the networks that ran beside other work had less than the rest.
+# stopped goes on where it was, and what is measured already is not measured again. The minutes are those of
+# the processor, so that a network that ran beside other work had no less than the rest.
 set -euo pipefail
 
 usage() { sed -n '2,9p' "$0" | sed 's/^# \{0,1\}//' >&2; exit 2; }

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from corrsfm.cli.options import config_options, recipe_options, usage_options
+from corrsfm.cli.options import PATH, config_options, recipe_options, usage_options
 from corrsfm.training.config import PrepareConfig
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["train"]
 
-PATH = click.Path(path_type=Path)
 _NUM_COMPARED_BATCHES = 8
 
 
@@ -66,7 +65,13 @@ def prepare(
 @recipe_options
 @click.option("--resume", is_flag=True, help="Continue the run in the output folder, if there is one.")
 @click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
-@click.option("--threads", default=0, show_default=True, help="Threads to use; 0 for all cores.")
+@click.option(
+    "--threads",
+    type=click.IntRange(0, 1024),
+    default=0,
+    show_default=True,
+    help="Threads to use; 0 for all cores.",
+)
 def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
     """Train by a recipe, alone or on several GPUs under torchrun."""
     if not recipe.train.train_files:

@@ -58,6 +58,7 @@ __all__ = [
 
 NO_NEIGHBOUR = 65535
 RATIO_STEPS = 255.0
+_LARGEST_SCENE_BYTES = 1 << 33
 """A stored ratio of 1."""
 _FORMAT, _VERSION = "corrsfm-pairs", 1
 _NUM_PARAMS = 12
@@ -285,7 +286,62 @@ def read_scenes(path: Path) -> list[CompactScene]:
             raise InputError(
                 f"{path}: not a compact pair file of version {_VERSION}; make one with: corrsfm train prepare"
             )
-        return [_decode(name, file[name]) for name in sorted(file)]
+        return [_read_scene(path, name, file) for name in sorted(file)]
+
+
+def _read_scene(path: Path, name: str, file: h5py.File) -> CompactScene:
+    try:
+        group = file[name]
+        if not isinstance(group, h5py.Group) or group.file.filename != file.filename:
+            raise ValueError("is no scene of this file")
+        if (num_bytes := sum(group[key].nbytes for key in group)) > _LARGEST_SCENE_BYTES:
+            raise ValueError(f"declares {num_bytes / 1e9:,.0f} GB")
+        scene = _decode(name, group)
+        _check_numbers(scene)
+    # Whatever damaged bytes or shapes lead to.
+    except (InputError, ArithmeticError, AttributeError, LookupError, MemoryError, OSError, RuntimeError,
+            TypeError, ValueError) as error:  # fmt: skip
+        raise InputError(
+            f"{path}: {name}: is damaged ({error}); make the file again with: corrsfm train prepare"
+        ) from error
+    return scene
+
+
+def _check_numbers(scene: CompactScene) -> None:
+    """Raise `ValueError` where arrays do not fit each other, so that nothing is looked up outside of them."""
+    num_images, num_pairs = len(scene.image_names), len(scene.pairs)
+    num_keypoints = np.diff(scene.keypoint_offsets)
+    fits = (
+        len(scene.cameras) == num_images
+        and scene.rotations.shape == (num_images, 3, 3)
+        and scene.translations.shape == (num_images, 3)
+        and scene.pairs.shape == (num_pairs, 2)
+        and scene.covisible.shape == (num_pairs,)
+        and _are_offsets(scene.keypoint_offsets, num_images, len(scene.keypoints))
+        and _are_offsets(scene.match_offsets, num_pairs, len(scene.neighbours))
+        and len(scene.ratios) == len(scene.mutual) == len(scene.neighbours)
+        and len(scene.corrections) == len(scene.log_scales) == len(scene.orientations) == len(scene.keypoints)
+    )
+    if not fits:
+        raise ValueError("arrays do not fit each other")
+    if not (np.isfinite(scene.rotations).all() and np.isfinite(scene.translations).all()):
+        raise ValueError("a pose is not finite")
+    if ((scene.pairs < 0) | (scene.pairs >= num_images)).any():
+        raise ValueError("a pair names a photo that is not there")
+    if (np.diff(scene.match_offsets) != num_keypoints[scene.pairs[:, 0]]).any():
+        raise ValueError("a pair has not one neighbour a keypoint")
+    partners = np.repeat(num_keypoints[scene.pairs[:, 1]], np.diff(scene.match_offsets))
+    if ((scene.neighbours >= partners) & (scene.neighbours != NO_NEIGHBOUR)).any():
+        raise ValueError("a neighbour is not there")
+
+
+def _are_offsets(offsets: NDArray[np.integer], num: int, end: int) -> bool:
+    return (
+        offsets.shape == (num + 1,)
+        and offsets[0] == 0
+        and offsets[-1] == end
+        and bool((np.diff(offsets) >= 0).all())
+    )
 
 
 def read_labelled_pairs(

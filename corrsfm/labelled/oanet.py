@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
-from corrsfm.files import atomic_path
+from corrsfm.files import atomic_path, require_file
 from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.types import Camera, Correspondences
 
@@ -144,10 +144,11 @@ def open_pairs(path: Path) -> Iterator[h5py.File]:
     InputError
         If it cannot be opened, or read inside the block.
     """
+    require_file(path)
     try:
         with h5py.File(path, "r") as handle:
             yield handle
-    except OSError as error:
+    except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
         raise InputError(
             f"{path}: cannot be read as HDF5 ({error}); expected a file of labelled pairs, "
             "made with: corrsfm train prepare"
@@ -213,7 +214,7 @@ def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
             scene=_scene(handle, index),
             name=f"{path.name} pair {index}",
         )
-    except (KeyError, ValueError) as error:
+    except (InputError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: pair {index} is damaged or incomplete ({error})") from error
 
 

@@ -49,16 +49,18 @@ class PrepareConfig:
 class AugmentConfig:
     """Random changes of real pairs."""
 
-    swap_probability: float = option(0.5, "Exchange the two photos", minimum=0)
-    mirror_probability: float = option(0.5, "Mirror both photos", minimum=0)
+    swap_probability: float = option(0.5, "Exchange the two photos", minimum=0, maximum=1)
+    mirror_probability: float = option(0.5, "Mirror both photos", minimum=0, maximum=1)
     quarter_turn_probability: float = option(
-        0.2, "Turn both photos by the same number of quarter turns", minimum=0
+        0.2, "Turn both photos by the same number of quarter turns", minimum=0, maximum=1
     )
-    turn_probability: float = option(0.5, "Turn each photo a little", minimum=0)
+    turn_probability: float = option(0.5, "Turn each photo a little", minimum=0, maximum=1)
     max_turn_deg: float = option(15.0, "Largest small turn", unit="deg", minimum=0)
-    undistort_probability: float = option(0.5, "Remove the lens distortion from the input", minimum=0)
+    undistort_probability: float = option(
+        0.5, "Remove the lens distortion from the input", minimum=0, maximum=1
+    )
     jitter_probability: float = option(
-        0.4, "Jitter the focal lengths; likewise the principal points", minimum=0
+        0.4, "Jitter the focal lengths; likewise the principal points", minimum=0, maximum=1
     )
     focal_jitter: float = option(
         0.08, "Standard deviation of the logarithm of a jittered focal length", minimum=0
@@ -70,8 +72,9 @@ class AugmentConfig:
         0.15,
         f"Use {DEFAULT_FOCAL_FACTOR} times the longest side as the focal length, as where nothing is known",
         minimum=0,
+        maximum=1,
     )
-    thin_probability: float = option(0.3, "Drop up to 85 % of the inliers", minimum=0)
+    thin_probability: float = option(0.3, "Drop up to 85 % of the inliers", minimum=0, maximum=1)
 
 
 NO_AUGMENTATION = AugmentConfig(
@@ -102,28 +105,33 @@ class TrainConfig:
     negative_share: float = option(
         0.0, "Share of real pairs that show two places, all wrong", minimum=0, maximum=0.9
     )
-    synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0)
+    synthetic_share: float = option(0.0, "Share of synthetic pairs in a batch", minimum=0, maximum=1)
     batch_size: int = option(32, "Pairs in a batch, on each device", minimum=1)
     num_matches: int = option(2000, "Matches drawn from each pair", minimum=32)
     max_steps: int = option(60_000, "Steps of a run that is not bounded by time", minimum=1)
     max_minutes: float = option(
-        0.0, "Time of the run, which then drives the schedule; 0 for no bound", minimum=0
+        0.0, "Time of the run, which then drives the schedule; 0 for no bound", minimum=0, maximum=1e6
     )
-    learning_rate: float = option(1e-3, "Largest learning rate", minimum=0)
+    processor_time: bool = option(
+        False, "Count the time of the processor in place of a clock's: the same work beside other programs"
+    )
+    learning_rate: float = option(1e-3, "Largest learning rate", minimum=0, maximum=1)
     schedule: Schedule = option(Schedule.ONE_CYCLE, "Course of the learning rate; both end at zero")
-    warm_up: float = option(0.05, "Share of the run in which the learning rate rises", minimum=0)
+    warm_up: float = option(0.05, "Share of the run in which the learning rate rises", minimum=0, maximum=1)
     weight_decay: float = option(1e-4, "Decoupled weight decay of AdamW", minimum=0)
     max_gradient_norm: float = option(1.0, "Gradients are scaled down to this length", minimum=0)
-    ema_decay: float = option(0.999, "Decay of the moving average of the weights; 0 for none", minimum=0)
+    ema_decay: float = option(
+        0.999, "Decay of the moving average of the weights; 0 for none", minimum=0, maximum=1
+    )
     threshold: float = option(
         INLIER_THRESHOLD, "Largest squared symmetric epipolar distance of an inlier", minimum=0
     )
-    essential_start: float = option(0.05, "Share of the run without the essential loss", minimum=0)
+    essential_start: float = option(0.05, "Share of the run without the essential loss", minimum=0, maximum=1)
     essential_weight: float = option(0.5, "Weight of the essential loss", minimum=0)
     bfloat16: bool = option(False, "Compute in bfloat16 where that is safe")
     compile: bool = option(False, "Compile the network", affects_result=False)
     scene_power: float = option(
-        0.5, "A scene is drawn in proportion to its number of pairs to this power", minimum=0
+        0.5, "A scene is drawn in proportion to its number of pairs to this power", minimum=0, maximum=10
     )
     validate_minutes: float = option(
         10.0, "Time between validations", unit="min", minimum=0, affects_result=False
@@ -143,9 +151,11 @@ class TrainConfig:
 class SyntheticConfig:
     """Synthetic pairs."""
 
-    min_inlier_ratio: float = option(0.03, "Smallest share of inliers", minimum=0)
-    max_inlier_ratio: float = option(0.9, "Largest share of inliers", minimum=0)
-    noise_px: float = option(0.5, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0)
+    min_inlier_ratio: float = option(0.03, "Smallest share of inliers", minimum=0, maximum=1)
+    max_inlier_ratio: float = option(0.9, "Largest share of inliers", minimum=0, maximum=1)
+    noise_px: float = option(
+        0.5, "Typical keypoint noise at a focal length of 1000", unit="px", minimum=0, maximum=1000
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.config import MatchInput
-from corrsfm.errors import InputError
+from corrsfm.errors import InputError, first_few
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, relative_pose
 from corrsfm.images.cameras import DEFAULT_FOCAL_FACTOR
 from corrsfm.labelled.compact import RATIO_STEPS, CompactScene, is_compact, quantise_ratios, read_scenes
@@ -166,7 +166,10 @@ class RealPairs:
         scenes: list[CompactScene | OANetPair] = []
         for path in paths:
             scenes.extend(read_scenes(path) if is_compact(path) else read_pairs(path))
-        return cls(scenes, device, **options)
+        try:
+            return cls(scenes, device, **options)
+        except InputError as error:
+            raise InputError(f"{first_few(map(str, paths))}: {error}") from error
 
     def _count_inliers(self) -> tuple[Tensor, Tensor]:
         ratios, counts = [], []

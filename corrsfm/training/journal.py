@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from corrsfm.config import to_dict
-from corrsfm.errors import DependencyError
+from corrsfm.errors import ConfigError, DependencyError
 from corrsfm.machine import versions
 from corrsfm.training.config import TrainRecipe
 
@@ -36,7 +36,12 @@ class Journal:
     def __init__(
         self, folder: Path, *, tensorboard: bool, on_row: Callable[[dict[str, Any]], None] | None = None
     ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(
+                f"{folder}: cannot be made ({error.strerror}); choose another --output"
+            ) from error
         self._folder, self._tensorboard, self._on_row = folder, tensorboard, on_row
         self._writer: Any = None
 

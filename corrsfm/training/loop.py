@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from corrsfm.config import MatchInput, to_dict
 from corrsfm.errors import ConfigError
+from corrsfm.labelled.compact import read_scenes
 from corrsfm.model import CorrAdaptor, Rival, RivalConfig, build_network, save_network
 from corrsfm.prune.correspondences import missing_channels
 from corrsfm.training.checkpoint import Average, load_state, save_state
@@ -74,8 +75,11 @@ def train(
         raise ConfigError(
             "synthetic pairs hold all nearest neighbours; set synthetic_share to 0 for input mutual"
         )
+    options = recipe.train
+    # If it is unusable, now and not after hours.
+    if options.val_file is not None:
+        read_scenes(options.val_file)
     with _process_group(torch.device(device)) as (rank, own_device):
-        options = recipe.train
         data = RealPairs.from_files(
             options.train_files,
             own_device,
@@ -170,13 +174,14 @@ class Trainer:
         """Train to the end; returns the path of the averaged weights."""
         if self.rank == 0:
             self._journal.write_recipe(self._provenance())
-        started = time.monotonic() - 60.0 * self.minutes
+        clock = time.process_time if self.config.processor_time else time.monotonic
+        started = clock() - 60.0 * self.minutes
         last = {"log": self.minutes, "save": self.minutes, "validate": self.minutes}
         sums: dict[str, float] = {}
         num_steps = 0
         while (progress := self._agreed_progress()) < 1.0:
             losses = self.train_step(progress)
-            self.minutes = (time.monotonic() - started) / 60.0
+            self.minutes = (clock() - started) / 60.0
             for name, value in losses.items():
                 sums[name] = sums.get(name, 0.0) + value
             num_steps += 1

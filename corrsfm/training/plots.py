@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import DependencyError, InputError
+from corrsfm.files import atomic_path, open_file
 from corrsfm.training.dataset import Batch
 
 __all__ = ["plot_distributions", "plot_learning_curves"]
@@ -31,15 +33,18 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, 
 
 def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with io.TextIOWrapper(open_file(path), encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); expected the log of a training run"
-        ) from error
-    if not rows:
-        return {}
-    return {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]}
+        return (
+            {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]} if rows else {}
+        )
+    except (ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: is damaged ({error}); expected the log of a training run") from error
+
+
+def _save(figure: Any, output: Path, dpi: int) -> None:
+    with atomic_path(output) as temporary:
+        figure.savefig(temporary, dpi=dpi, format="png")
 
 
 def plot_learning_curves(run_folder: Path, output: Path) -> None:
@@ -70,8 +75,7 @@ def plot_learning_curves(run_folder: Path, output: Path) -> None:
         )
         axes[3].legend(fontsize="small")
     axes[3].set(title="pose AUC behind LO-RANSAC, validation", xlabel="step")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=90)
+    _save(figure, output, dpi=90)
 
 
 def _measures(batches: Sequence[Batch]) -> dict[str, NDArray[np.float64]]:
@@ -129,5 +133,4 @@ def plot_distributions(real: Sequence[Batch], synthetic: Sequence[Batch], output
             axis.hist(measure[name], bins=bins, density=True, alpha=0.5, color=_COLOURS[kind], label=kind)
         axis.set(title=name, yticks=[])
     axes[0].legend()
-    output.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(output, dpi=70)
+    _save(figure, output, dpi=70)

@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from corrsfm.colmap.cameras import camera_from_pycolmap, normalise_by_pinhole, normalise_points
 from corrsfm.colmap.models import find_model, poses_of, read_model
 from corrsfm.config import FeaturesConfig
-from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError
+from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError, first_few
 from corrsfm.features import create_extractor, reads_colour
+from corrsfm.files import read_text
 from corrsfm.images.photos import read_colour, read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
 from corrsfm.labelled.oanet import write_pairs
@@ -68,10 +69,12 @@ def read_splits(path: Path) -> dict[str, list[str]]:
         If the file is not such a list or names a scene twice.
     """
     try:
-        splits = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        splits = json.loads(read_text(Path(path)))
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON of scene names by split ({error})") from error
-    if not isinstance(splits, dict) or not all(isinstance(names, list) for names in splits.values()):
+    if not isinstance(splits, dict) or not all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in splits.values()
+    ):
         raise InputError(f"{path}: expected an object with a list of scene names for each split")
     repeated = [
         name for name, count in Counter(n for names in splits.values() for n in names).items() if count > 1
@@ -116,12 +119,23 @@ def scenes_of_split(folder: Path, splits: Path, split: str) -> list[Path]:
     Raises
     ------
     InputError
-        If the file has no such split.
+        If the file has no such split, or a scene of it is not there.
     """
     names = read_splits(splits)
     if split not in names:
         raise InputError(f"{splits}: has no split '{split}', only {', '.join(names)}")
-    return [Path(folder) / name for name in names[split]]
+    folders = [Path(folder) / name for name in names[split]]
+    if missing := [path.name for path in folders if not _is_folder(path)]:
+        raise InputError(f"{splits}: names scenes that are not in {folder}: {first_few(missing)}")
+    return folders
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether a folder is there; False also for names that no file can have."""
+    try:
+        return path.is_dir()
+    except (OSError, ValueError):
+        return False
 
 
 def prepare_file(output: Path, scenes: Iterable[Path], config: PrepareConfig) -> list[tuple[str, int]]:
@@ -280,16 +294,16 @@ def _corrections(camera: Camera, keypoints: NDArray[np.float32]) -> NDArray[np.f
 
 
 def _read_model(folder: Path) -> _SceneModel:
-    reconstruction = read_model(find_model(folder))
+    path = find_model(folder)
+    reconstruction = read_model(path)
     poses = poses_of(reconstruction)
     names = tuple(poses)
     images = {image.name: image for image in reconstruction.images.values()}
-    cameras = tuple(
-        replace(
-            camera_from_pycolmap(reconstruction.cameras[images[name].camera_id]), has_prior_focal_length=True
-        )
-        for name in names
-    )
+    try:
+        known = {number: camera_from_pycolmap(camera) for number, camera in reconstruction.cameras.items()}
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    cameras = tuple(replace(known[images[name].camera_id], has_prior_focal_length=True) for name in names)
     return _SceneModel(
         names=names,
         cameras=cameras,

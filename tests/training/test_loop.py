@@ -147,12 +147,15 @@ def test_steps_that_are_not_finite_are_counted_and_change_nothing(data, tmp_path
         assert torch.equal(value, before[name]), name
 
 
-def test_a_run_bounded_by_time_ends_at_learning_rate_zero(data, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("processor_time", "clock"), [(False, "monotonic"), (True, "process_time")])
+def test_a_run_bounded_by_time_ends_at_learning_rate_zero(data, tmp_path, monkeypatch, processor_time, clock):
     # A clock of the test's, so that a busy machine cannot end the run after one step: 0.2 s a step.
     ticks = itertools.count()
-    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: 0.2 * next(ticks)))
+    still = {"monotonic": lambda: 0.0, "process_time": lambda: 0.0}
+    moving = {clock: lambda: 0.2 * next(ticks)}
+    monkeypatch.setattr(loop, "time", SimpleNamespace(**{**still, **moving}))
     rows = []
-    recipe = make_recipe(tmp_path, max_minutes=0.03)
+    recipe = make_recipe(tmp_path, max_minutes=0.03, processor_time=processor_time)
     Trainer(recipe, data, CPU, on_log=rows.append).run()
     assert rows[-2]["minutes"] <= 0.03 <= rows[-1]["minutes"]
     assert rows[-1]["learning_rate"] < rows[len(rows) // 2]["learning_rate"]

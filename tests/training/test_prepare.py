@@ -48,10 +48,13 @@ def test_a_scene_in_two_splits_is_refused(tmp_path):
     path.write_text(json.dumps({"train": ["a", "b"], "test": ["b"]}))
     with pytest.raises(InputError, match="more than once: b"):
         read_splits(path)
-    path.write_text(json.dumps({"train": ["a"]}))
-    assert scenes_of_split(Path("photos"), path, "train") == [Path("photos/a")]
+    path.write_text(json.dumps({"train": ["a"], "val": ["a" * 5000]}))
+    (tmp_path / "a").mkdir()
+    assert scenes_of_split(tmp_path, path, "train") == [tmp_path / "a"]
     with pytest.raises(InputError, match="no split 'test'"):
-        scenes_of_split(Path("photos"), path, "test")
+        scenes_of_split(tmp_path, path, "test")
+    with pytest.raises(InputError, match="names scenes that are not in"):
+        scenes_of_split(tmp_path, path, "val")
 
 
 def test_chosen_pairs_spread_over_the_range_of_difficulty():
