@@ -3,16 +3,25 @@
 ::
 
     workspace/
-    ├── folder.py     paths, the lock, which stages are finished
+    ├── folder.py     paths, which stages are finished
+    ├── lease.py      which process holds it
+    ├── entries.py    that nothing in it is a link or a pipe
     ├── lists.py      images.txt, images.json, pairs.txt
-    ├── hloc.py       the HDF5 layout of features and matches
-    ├── store.py      items in an HDF5 file, written whole
-    ├── journal.py    items finished since, each safe at once
+    ├── items.py      features and matches as they are stored
+    ├── store.py      items in an SQLite file, each safe at once
+    ├── rows.py       the tables of such a file, and their checksums
+    ├── stores.py     the stores of a workspace
+    ├── conversion.py those of earlier versions, in HDF5
+    ├── hloc.py       hloc's keys and its half pixel
+    ├── shards.py     items made by the workers of a cluster
+    ├── models.py     the models, also where they were changed since
     ├── resume.py     what a stage keeps and what it makes again
+    ├── heard.py      listening to what one thread warns of
     ├── warned.py     what each stage warned of
     └── commands.py   the command that makes a stage again
 """
 
-from corrsfm.workspace.folder import StageRecord, Workspace
+from corrsfm.workspace.folder import Workspace
+from corrsfm.workspace.manifest import StageRecord
 
 __all__ = ["StageRecord", "Workspace"]

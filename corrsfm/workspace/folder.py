@@ -3,18 +3,17 @@
 ::
 
     WORKSPACE/
-    ├── workspace.json      format version, image folder, per stage fingerprint, options and seconds, and what
-    │                       the items of a file took to make
+    ├── workspace.json      format version, image folder, per stage fingerprint, options and seconds
     ├── frames/             frames of a video, and frames.json with their times
     ├── converted/          JPEGs of HEIC and AVIF photos, and links to the other photos
     ├── images.txt          names of the photos, one per line
     ├── images.json         photos and cameras as corrsfm knows them
-    ├── features.h5         keypoints and descriptors
+    ├── features.db         keypoints and descriptors
     ├── pairs.txt           pairs to match, ``name0 name1``
     ├── pair_origins.tsv    the strategies that proposed each pair
-    ├── matches.h5          putative matches
-    ├── pruned.h5           matches that passed pruning
-    ├── .pruned/METHOD.h5   those of each method that was tried; pruned.h5 is the last one, by another name
+    ├── matches.db          putative matches
+    ├── pruned/METHOD.db    matches that passed pruning, for each method that was tried
+    ├── .shards/            items that workers of a cluster made and that were not merged yet
     ├── cameras.json        which photos share a camera, and by what evidence
     ├── database.db         COLMAP database with verified two-view geometries
     ├── sparse/0, 1, …      models, the largest first
@@ -28,63 +27,44 @@
     ├── run.json            versions, options, hashes and seconds of the last `corrsfm run`
     └── log.txt             what pycolmap had to say
 
-Every file is written under another name and renamed, so a file that exists is whole. A stage is current if
-its recorded fingerprint, a hash of its options and of the fingerprints of its inputs, equals the wanted one.
+Every file is written under another name and renamed, so a file that exists is whole; but for features.db,
+matches.db and those of pruned, which take in one item after the other (`corrsfm.workspace.store`). A stage is
+current if its recorded fingerprint, a hash of its options and of the fingerprints of its inputs, equals the
+wanted one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
-import json
+import hashlib
 import logging
 import os
 import shlex
 import shutil
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import FRAME_TIMES, atomic_write_json
+from corrsfm import config as cfg
+from corrsfm.colmap.sqlite import rows_digest
+from corrsfm.errors import ConfigError, InputError, WorkspaceError
+from corrsfm.files import FRAME_TIMES, OWN_RECORD, read_bytes, sha256_of
 from corrsfm.workspace.commands import command_for, label_of
+from corrsfm.workspace.entries import check_entries
+from corrsfm.workspace.lease import hold
+from corrsfm.workspace.manifest import FORMAT_VERSION, StageRecord, read_manifest, write_manifest
 
-__all__ = ["StageRecord", "Workspace"]
+__all__ = ["Workspace"]
 
 logger = logging.getLogger("corrsfm")
 
-FORMAT_VERSION = 1
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-
-
-@dataclass(frozen=True, kw_only=True)
-class StageRecord:
-    """What the workspace remembers of a finished stage.
-
-    Attributes
-    ----------
-    fingerprint : str
-        Hash of the stage's options and of the fingerprints of its inputs.
-    config : dict
-        The options, for people to read.
-    inputs : dict
-        Stage → fingerprint of what it read.
-    seconds : float
-        Wall-clock seconds that what is there took to make, over all runs that had a part in it.
-    num_items, num_reused : int
-        Items of the stage, and how many of them an earlier run had done.
-    """
-
-    fingerprint: str
-    config: dict[str, Any] = field(default_factory=dict)
-    inputs: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
-    num_items: int = 0
-    num_reused: int = 0
-    finished_at: str = ""
+_FILES = {
+    "images": ("images.json", "images.txt"),
+    "pairs": ("pairs.txt", "pair_origins.tsv"),
+    "verified matches": ("cameras.json", "database.db"),
+    "models": ("evidence.json",),
+}
 
 
 class Workspace:
@@ -118,11 +98,11 @@ class Workspace:
         self.images_txt = root / "images.txt"
         self.images_json = root / "images.json"
         self.photo_cache = root / ".photos.json"
-        self.features = root / "features.h5"
+        self.features = root / "features.db"
         self.pairs = root / "pairs.txt"
         self.pair_origins = root / "pair_origins.tsv"
-        self.matches = root / "matches.h5"
-        self.pruned = root / "pruned.h5"
+        self.matches = root / "matches.db"
+        self.shards = root / ".shards"
         self.cameras_json = root / "cameras.json"
         self.database = root / "database.db"
         self.sparse = root / "sparse"
@@ -141,7 +121,7 @@ class Workspace:
         self._begun: tuple[set[str], list[Path]] | None = None
         if not self.manifest.exists():
             self._start(create)
-        self._values = self._load()
+        self._values = read_manifest(self.manifest)
 
     def _start(self, create: bool) -> None:
         if not create:
@@ -165,83 +145,81 @@ class Workspace:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise WorkspaceError(f"{self.root}: cannot be made ({error.strerror})") from error
-        atomic_write_json(self.manifest, {"format_version": FORMAT_VERSION, "images_dir": None, "stages": {}})
+        self._values = {"format_version": FORMAT_VERSION, "images_dir": None, "stages": {}}
+        self._write()
 
-    def _load(self) -> dict[str, Any]:
-        try:
-            values = json.loads(self.manifest.read_text(encoding="utf-8"))
-            version = values["format_version"]
-            if version == FORMAT_VERSION:
-                _check_manifest(values)
-        except PermissionError as error:
-            raise WorkspaceError(f"{self.manifest}: may not be read; check its permissions") from error
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise WorkspaceError(
-                f"{self.manifest}: damaged ({error!r}); delete this file alone and run the commands of the "
-                "workspace again, finished features and matches are kept"
-            ) from error
-        if version != FORMAT_VERSION:
-            raise WorkspaceError(
-                f"{self.root}: workspace of format version {version}, this corrsfm reads version "
-                f"{FORMAT_VERSION}; use the corrsfm that made it, or another folder"
-            )
-        return values
+    def _write(self) -> None:
+        write_manifest(self.manifest, self._values)
 
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
+    def lock(self, *, wait: bool = False) -> Iterator[None]:
         """Hold the workspace for this process; one that was begun with unusable input vanishes again.
+
+        Parameters
+        ----------
+        wait : bool
+            Wait for another process that holds it instead of failing.
 
         Raises
         ------
         WorkspaceError
             If another process holds it, or nothing can be written there.
         """
-        try:
-            # A link in its place could lead to any file.
-            flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
-            handle = os.fdopen(os.open(self.root / ".lock", flags, 0o666), "r+")
-        except OSError as error:
-            raise WorkspaceError(
-                f"{self.root}: nothing can be written there ({error.strerror}); check the permissions, or "
-                "work on a copy of the folder"
-            ) from error
-        with handle:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise WorkspaceError(
-                    f"{self.root}: another corrsfm works in this workspace; wait for it or choose another "
-                    "folder"
-                ) from error
-            except OSError as error:
-                if error.errno not in _NO_LOCKS:
-                    raise WorkspaceError(f"{self.root}: cannot be locked ({error.strerror})") from error
-                logger.warning(
-                    "%s: this file system has no locks (%s); do not let a second corrsfm work there now",
-                    self.root,
-                    error.strerror,
-                )
-            self._values = self._load()
+        with hold(self.root / ".lock", wait=wait):
+            check_entries(self.root, self._own_names, may_link=False)
+            self._values = read_manifest(self.manifest)
+            if self._values["format_version"] < FORMAT_VERSION:
+                self._convert()
             try:
                 yield
-            except InputError:
+            except (ConfigError, InputError):
                 if self._begun is not None and not self._values["stages"]:
                     self._vanish(*self._begun)
                 raise
+
+    def modernise(self) -> None:
+        """Convert a workspace of an earlier version, which reading alone cannot use.
+
+        Raises
+        ------
+        WorkspaceError
+            As `lock`, or if a file of it cannot be read.
+        """
+        if self._values["format_version"] < FORMAT_VERSION:
+            with self.lock():
+                pass
+
+    def _convert(self) -> None:
+        from corrsfm.workspace.conversion import convert_items
+
+        convert_items(self)
+        self._values.pop("costs", None)
+        self._values["format_version"] = FORMAT_VERSION
+        self._write()
 
     def _vanish(self, before: set[str], made: list[Path]) -> None:
         """Remove what making the workspace left, so that a mistyped command leaves nothing."""
         for path in (self.manifest, self.photo_cache, self.warnings_json, self.log, self.root / ".lock"):
             if path.name not in before:
                 path.unlink(missing_ok=True)
+        for folder in (self.frames, self.converted):
+            if folder.name not in before and (folder / OWN_RECORD).is_file():
+                shutil.rmtree(folder)
         # Fails where something of use is there.
         with contextlib.suppress(OSError):
             for folder in made:
                 folder.rmdir()
 
+    @property
+    def pruned(self) -> Path:
+        """Where the kept matches lie of the prune method that was used last."""
+        record = self.record_of("pruned matches")
+        method = record.config.get("method") if record is not None else None
+        return self.pruned_by(method or cfg.PruneConfig().method)
+
     def pruned_by(self, method: str) -> Path:
         """Where the kept matches of a prune method lie, whichever is the current one."""
-        return self.root / ".pruned" / f"{method}.h5"
+        return self.root / "pruned" / f"{method}.db"
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[None]:
@@ -252,6 +230,7 @@ class Workspace:
         WorkspaceError
             If another process works there.
         """
+        self.modernise()
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):
                 handle = stack.enter_context(open(self.root / ".lock", encoding="utf-8"))
@@ -261,8 +240,15 @@ class Workspace:
                     raise WorkspaceError(
                         f"{self.root}: another corrsfm works in this workspace; wait for it"
                     ) from error
-            self._values = self._load()
+            check_entries(self.root, self._own_names, may_link=True)
+            self._values = read_manifest(self.manifest)
             yield
+
+    @property
+    def _own_names(self) -> list[str]:
+        """Names of what is written in the root, but for the copies of photos, which are links by design."""
+        places = {path for path in vars(self).values() if isinstance(path, Path) and path.parent == self.root}
+        return sorted({path.name for path in places - {self.converted}} | {"pruned"})
 
     @property
     def images_dir(self) -> Path:
@@ -285,7 +271,7 @@ class Workspace:
         resolved, root = folder.resolve(), self.root.resolve()
         inside = resolved in (self.frames.resolve(), self.converted.resolve())
         self._values["images_dir"] = str(resolved.relative_to(root) if inside else resolved)
-        atomic_write_json(self.manifest, self._values)
+        self._write()
 
     @property
     def given_photos(self) -> tuple[str, ...]:
@@ -309,13 +295,35 @@ class Workspace:
         return StageRecord(**values) if values else None
 
     def is_current(self, stage: str, fingerprint: str, *artefacts: Path) -> bool:
-        """True if the stage finished with this fingerprint and its artefacts are still there."""
+        """True if the stage finished with this fingerprint and its artefacts are still there, and whole."""
         record = self.record_of(stage)
         return (
             record is not None
             and record.fingerprint == fingerprint
             and all(path.exists() for path in artefacts)
+            and all(
+                self._digest(path.name) == record.files[path.name]
+                for path in artefacts
+                if path.name in record.files
+            )
         )
+
+    def read_list(self, stage: str, path: Path) -> bytes:
+        """What a list holds that a stage wrote.
+
+        Raises
+        ------
+        OSError
+            If it cannot be read.
+        ValueError
+            If it is not what the stage wrote.
+        """
+        content = read_bytes(path)
+        record = self.record_of(stage)
+        wanted = record.files.get(path.name) if record is not None else None
+        if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:
+            raise ValueError("not as it was written")
+        return content
 
     def require(self, stage: str) -> StageRecord:
         """The record of a stage that must have finished, with inputs that have not changed since.
@@ -370,26 +378,42 @@ class Workspace:
             {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
         )
 
-    def cost_of(self, path: Path) -> tuple[float, int]:
-        """Seconds that the items of a file took to make, and how many they are; zeros if it is not known."""
-        cost = self._values.get("costs", {}).get(path.relative_to(self.root).as_posix(), {})
-        return float(cost.get("seconds", 0.0)), int(cost.get("num_items", 0))
-
-    def finish(self, stage: str, record: StageRecord, made: Path | None = None) -> None:
-        """Record a stage as finished now, and its seconds as what the items of a file took."""
-        if made is not None:
-            cost = {"seconds": record.seconds, "num_items": record.num_items}
-            self._values.setdefault("costs", {})[made.relative_to(self.root).as_posix()] = cost
+    def finish(self, stage: str, record: StageRecord) -> None:
+        """Record a stage as finished now."""
         if stage == "models":
             self._values.pop("mapping_failed", None)
-        stamped = {**record.__dict__, "finished_at": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
+        files = {name: digest for name in self._files_of(stage) if (digest := self._digest(name)) is not None}
+        now = time.strftime("%Y-%m-%dT%H:%M:%S%z")
+        stamped = {**record.__dict__, "files": files, "finished_at": now}
         self._values["stages"][stage] = stamped
-        atomic_write_json(self.manifest, self._values)
+        self._write()
+
+    def _files_of(self, stage: str) -> list[str]:
+        """Files that a stage leaves, but for stores, which have checksums of their own."""
+        models = sorted(self.sparse.glob("*/*")) if stage == "models" else []
+        return [*_FILES.get(stage, ()), *(path.relative_to(self.root).as_posix() for path in models)]
+
+    def _digest(self, name: str) -> str | None:
+        """Hash of what a file holds; of COLMAP's database of its rows, whose bytes reading changes."""
+        path = self.root / name
+        if not path.is_file():
+            return None
+        return rows_digest(path) if path == self.database else sha256_of(path)
+
+    def changed_files(self, stage: str) -> list[Path]:
+        """Files of a finished stage that do not hold what it wrote, or are gone.
+
+        Those of stages that an earlier version finished are not known, nor are stores, which have checksums
+        of their own.
+        """
+        record = self.record_of(stage)
+        wanted = record.files if record is not None else {}
+        return [self.root / name for name, digest in wanted.items() if self._digest(name) != digest]
 
     def forget(self, stage: str) -> None:
         """Drop the record of a stage, so that it is not taken for finished."""
         if self._values["stages"].pop(stage, None) is not None:
-            atomic_write_json(self.manifest, self._values)
+            self._write()
 
     @property
     def mapping_failed(self) -> bool:
@@ -407,7 +431,7 @@ class Workspace:
         self.adding.unlink(missing_ok=True)
         if verified := self.record_of("verified matches"):
             self._values["mapping_failed"] = verified.fingerprint
-            atomic_write_json(self.manifest, self._values)
+            self._write()
         if not self.sparse.is_dir():
             self.run_json.unlink(missing_ok=True)
             return
@@ -419,13 +443,3 @@ class Workspace:
             shutil.rmtree(aside)
         os.replace(self.sparse, aside)
         logger.warning("the models of the earlier matches were moved to %s", aside)
-
-
-def _check_manifest(values: dict[str, Any]) -> None:
-    """Check a manifest on loading, so that damage is reported at once."""
-    if not isinstance(values["images_dir"], str | None):
-        raise TypeError("images_dir is not text")
-    if not all(isinstance(item, str) for item in values.get("given", [])):
-        raise TypeError("given is not a list of texts")
-    for record in values["stages"].values():
-        StageRecord(**record)

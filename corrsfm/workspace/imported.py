@@ -1,4 +1,4 @@
-"""What a scene's features and matches are: made here, brought in by `corrsfm import`, or a foreign file.
+"""What a scene's features and matches are: made here, or brought in by `corrsfm import`.
 
 Imported features carry the fingerprint ``imported PHOTO CONTENT``, two hashes: they hold as long as the photo
 does, and no extractor could make them again.
@@ -6,19 +6,15 @@ does, and no extractor could make them again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
-
-import h5py
 
 from corrsfm import config as cfg
 from corrsfm.errors import ConfigError, WorkspaceError, first_few
 from corrsfm.types import Pair, PairList
-from corrsfm.workspace.folder import StageRecord, Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, Kind
+from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.manifest import StageRecord
+from corrsfm.workspace.stores import features_of, matches_of
 
 __all__ = [
     "fingerprint_of_imported",
@@ -26,8 +22,6 @@ __all__ = [
     "imported_from",
     "imported_matches",
     "record_imported_pairs",
-    "refuse_foreign",
-    "refuse_foreign_files",
     "traits_of",
     "traits_to_come",
     "traits_with",
@@ -58,7 +52,7 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
         If a photo is new or has changed since the import.
     """
     records = read_index(workspace).records
-    store = ItemStore(workspace.features, FEATURES)
+    store = features_of(workspace)
     held = store.held([record.name for record in records])
     lacking = [
         record.name
@@ -76,7 +70,7 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
 
 def imported_matches(workspace: Workspace) -> dict[Pair, str]:
     """Fingerprints of imported matches, which are what they are."""
-    return ItemStore(workspace.matches, MATCHES).fingerprints(read_pairs(workspace).pairs)
+    return matches_of(workspace).fingerprints(read_pairs(workspace).pairs)
 
 
 def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg.ImportedConfig) -> None:
@@ -156,64 +150,3 @@ def _refuse_others(workspace: Workspace, what: str, wanted: str, default: str) -
             f"{workspace.root}: its {what} were imported and are kept; for those of {wanted} choose another "
             "folder"
         )
-
-
-def refuse_foreign_files(workspace_dir: Path) -> None:
-    """Refuse a folder whose files of features or matches another tool wrote; nothing is touched.
-
-    Raises
-    ------
-    WorkspaceError
-        Naming the file, what it holds and how to import it.
-    """
-    kinds: Mapping[str, Kind] = {"features.h5": FEATURES, "matches.h5": MATCHES}
-    for name, kind in kinds.items():
-        refuse_foreign(workspace_dir / name, kind)
-
-
-def refuse_foreign(path: Path, kind: Kind) -> None:
-    """Refuse to write a file that another tool wrote.
-
-    Raises
-    ------
-    WorkspaceError
-        Naming the file, what it holds and how to import it.
-    """
-    if not path.is_file():
-        return
-    try:
-        with h5py.File(path, "r") as file:
-            if str(file.attrs.get("format", "")).startswith("corrsfm-"):
-                return
-            what = _describe(file)
-    except OSError:
-        # Damaged, or no HDF5 at all: whoever reads it says so.
-        return
-    folder = path.parent
-    flags = f"--features {path}"
-    if kind.label == MATCHES.label:
-        flags = f"--features {folder / 'features.h5'} --matches {path}"
-    raise WorkspaceError(
-        f"{path}: another tool wrote it ({what}); it is not overwritten. Choose another folder, or use what "
-        f"it holds there: corrsfm import PHOTOS ANOTHER_FOLDER {flags}"
-    )
-
-
-def _describe(file: h5py.File) -> str:
-    """What a foreign HDF5 file holds, in a few words."""
-    num_photos = num_pairs = 0
-    size = 0
-
-    def visit(name: str, item: object) -> None:
-        nonlocal num_photos, num_pairs, size
-        if isinstance(item, h5py.Group) and "keypoints" in item:
-            num_photos += 1
-            if not size and "descriptors" in item:
-                size = item["descriptors"].shape[0]
-        if isinstance(item, h5py.Group) and "matches0" in item:
-            num_pairs += 1
-
-    file.visititems(visit)
-    if num_photos:
-        return f"keypoints of {num_photos} photos" + (f", descriptors of {size} numbers" if size else "")
-    return f"matches of {num_pairs} pairs" if num_pairs else "neither keypoints nor matches in hloc's layout"

@@ -7,12 +7,14 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+import sys
 from dataclasses import dataclass
 from typing import Any
 
 from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import atomic_write_json, atomic_write_text
+from corrsfm.files import atomic_write_json, atomic_write_text, read_json
 from corrsfm.types import Camera, ImageRecord, PairList
 from corrsfm.workspace.folder import Workspace
 
@@ -72,14 +74,14 @@ def read_index(workspace: Workspace) -> Index:
     """
     path = workspace.images_json
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(workspace.read_list("images", path))
         cameras = tuple(Camera(**_tuples(entry, "params")) for entry in values["cameras"])
         records = tuple(ImageRecord(**_tuples(entry, "gps")) for entry in values["images"])
     except FileNotFoundError as error:
         raise WorkspaceError(
             f"{path}: missing; index the photos with: {workspace.command_for('images')}"
         ) from error
-    except (InputError, OSError, ValueError, KeyError, TypeError) as error:
+    except (InputError, OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise WorkspaceError(
             f"{path}: damaged ({error}); make it again with: {workspace.command_for('images')}"
         ) from error
@@ -89,7 +91,7 @@ def read_index(workspace: Workspace) -> Index:
 def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
     """Photos that were put into finished models, and what is known of each; empty if there are none."""
     try:
-        return dict(json.loads(workspace.added.read_text(encoding="utf-8"))["photos"])
+        return dict(read_json(workspace.added)["photos"])
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -126,13 +128,17 @@ def read_pairs(workspace: Workspace) -> PairList:
     path = workspace.pair_origins
     try:
         # splitlines would also split at characters that a name may hold.
-        lines = path.read_text(encoding="utf-8").split("\n")
-        rows = [line.split("\t") for line in lines if line]
-        return PairList(
-            pairs=tuple((name0, name1) for name0, name1, _ in rows),
-            origins=tuple(tuple(origin.split(",")) for _, _, origin in rows),
-        )
+        lines = workspace.read_list("pairs", path).decode().split("\n")
+        rows = (line.split("\t") for line in lines if line)
+        # A large scene has each name and each origin many times: one object for all.
+        origin_of = functools.cache(lambda text: tuple(text.split(",")))
+        pairs, origins = [], []
+        for name0, name1, origin in rows:
+            pairs.append((sys.intern(name0), sys.intern(name1)))
+            origins.append(origin_of(origin))
+        return PairList(pairs=tuple(pairs), origins=tuple(origins))
     except FileNotFoundError as error:
         raise WorkspaceError(f"{path}: missing; run: {workspace.command_for('pairs')}") from error
-    except ValueError as error:
-        raise WorkspaceError(f"{path}: damaged; run: {workspace.command_for('pairs')} --overwrite") from error
+    except (OSError, ValueError) as error:
+        command = f"{workspace.command_for('pairs')} --overwrite"
+        raise WorkspaceError(f"{path}: damaged ({error}); run: {command}") from error

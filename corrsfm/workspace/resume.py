@@ -8,23 +8,23 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from corrsfm import config as cfg
-from corrsfm.errors import WorkspaceError
-from corrsfm.files import share_file
+from corrsfm.errors import CorrsfmError, DamageError, WorkspaceError
 from corrsfm.types import Pair
 from corrsfm.workspace.commands import label_of
-from corrsfm.workspace.folder import StageRecord, Workspace
-from corrsfm.workspace.hloc import FEATURES
-from corrsfm.workspace.imported import imported_from, imported_matches, refuse_foreign
+from corrsfm.workspace.folder import Workspace
+from corrsfm.workspace.imported import imported_from, imported_matches
 from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.manifest import StageRecord
+from corrsfm.workspace.shards import discard_shards, merge_shards
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 
 __all__ = [
     "StageOutcome",
@@ -78,13 +78,13 @@ def complete(
     stage: str,
     store: ItemStore[K, T],
     wanted: Mapping[K, str],
-    produce: Callable[[list[K]], Iterable[tuple[K, T]]],
+    produce: Callable[[list[K]], Iterable[tuple[K, T | CorrsfmError | None]]],
     config: Any,
     *,
     inputs: dict[str, str],
     overwrite: bool,
     unit: str,
-    shown_as: Path | None = None,
+    verify: bool = False,
 ) -> StageOutcome:
     """Bring a store to exactly the wanted items, keeping finished ones.
 
@@ -96,8 +96,9 @@ def complete(
     wanted : mapping
         Key → fingerprint of every item the stage consists of.
     produce : callable
-        Missing keys → (key, item) as they are done. Each is safe on disk before the next is asked for. It
-        may change the ``wanted`` fingerprint of a key that it could not make.
+        Missing keys → (key, item) as they are done, None for an item that it put into the store itself, and
+        an error to end with. Each is safe on disk before the next is asked for. It may change the ``wanted``
+        fingerprint of a key that it could not make.
     config : dataclass
         The stage's options, for the record.
     inputs : dict
@@ -106,59 +107,78 @@ def complete(
         Make all items again.
     unit : str
         What an item is, for the progress bar.
-    shown_as : Path, optional
-        The name under which other stages read the file, if it is not that of the store.
+    verify : bool
+        Read what is finished and make damaged items again.
 
     Raises
     ------
     WorkspaceError
-        If another tool wrote the file of the store.
+        If the store cannot be read or written.
     """
-    refuse_foreign(store.path, store.kind)
     started = time.monotonic()
-    artefact = shown_as or store.path
     fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
-    finished = set() if overwrite else store.finished(wanted)
+    finished = set() if overwrite else _finished(store, wanted, fingerprint, verify=verify)
     missing = [key for key in wanted if key not in finished]
-    if not missing and workspace.is_current(stage, fingerprint, artefact):
-        store.discard_journal()
+    is_whole = not missing and store.seal() == fingerprint
+    if is_whole and workspace.is_current(stage, fingerprint, store.path):
+        discard_shards(workspace, store)
         return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
     explain(workspace, stage, config)
-    if finished:
-        logger.info(
-            "%s: %d of %d up to date, %d to do", label_of(stage), len(finished), len(wanted), len(missing)
-        )
+    # From here on the store no longer holds what the record says.
+    workspace.forget(stage)
     spent_on_items = 0.0
     try:
+        if overwrite:
+            discard_shards(workspace, store)
+        elif merge_shards(workspace, store):
+            finished = store.finished(wanted)
+            missing = [key for key in wanted if key not in finished]
+        if finished:
+            logger.info(
+                "%s: %d of %d up to date, %d to do", label_of(stage), len(finished), len(wanted), len(missing)
+            )
         with tqdm(
             total=len(wanted), initial=len(finished), desc=label_of(stage), unit=unit, leave=False
         ) as bar:
             before = time.monotonic()
             for key, item in produce(missing):
+                if isinstance(item, CorrsfmError):
+                    raise item
                 now = time.monotonic()
-                store.add(key, wanted[key], item, now - before)
+                if item is not None:
+                    store.add(key, wanted[key], item, now - before)
                 spent_on_items += now - before
                 before = now
                 bar.update()
-        workspace.forget(stage)
-        cost, num_earlier = workspace.cost_of(store.path)
-        if missing or num_earlier != len(wanted) or store.journal.path.exists():
-            num_new, new_seconds = store.commit(
-                wanted, lambda keys: tqdm(keys, desc=f"writing {artefact.name}", unit=unit, leave=False)
-            )
-            # What is there cost its share of what the file had cost, the new items, and the writing now.
-            cost *= min((len(wanted) - num_new) / num_earlier, 1.0) if num_earlier else 0.0
-            cost += new_seconds + time.monotonic() - started - spent_on_items
-        if shown_as is not None:
-            share_file(store.path, shown_as)
+        discard_shards(workspace, store)
+        fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
+        # Another method's store may have been the one in use meanwhile.
+        if not is_whole:
+            store.commit(wanted, fingerprint, known=finished)
+        seconds_of_items = store.seconds()
     finally:
         store.close()
-    fingerprint = cfg.config_hash(stage, sorted(wanted.values()), inputs)
     outcome = StageOutcome(
         stage=stage, num_items=len(wanted), num_reused=len(finished), seconds=time.monotonic() - started
     )
-    finish(workspace, outcome, fingerprint, config, inputs=inputs, cost=cost, made=store.path)
+    cost = seconds_of_items + outcome.seconds - spent_on_items
+    finish(workspace, outcome, fingerprint, config, inputs=inputs, cost=cost)
     return outcome
+
+
+def _finished(store: ItemStore[K, T], wanted: Mapping[K, str], fingerprint: str, *, verify: bool) -> Set[K]:
+    """Keys of finished items; damaged ones are dropped from the store with a warning."""
+    lost = store.mend() if verify else []
+    try:
+        if not verify and not lost and store.seal() == fingerprint:
+            return wanted.keys()
+        finished = store.finished(wanted)
+    except DamageError:
+        lost += store.mend()
+        finished = store.finished(wanted)
+    for what in lost:
+        logger.warning("%s", what)
+    return finished
 
 
 def finish(
@@ -168,7 +188,6 @@ def finish(
     config: Any,
     inputs: dict[str, str] | None = None,
     cost: float | None = None,
-    made: Path | None = None,
 ) -> None:
     """Record what a stage did; ``cost`` is what all of it took if earlier runs had a part in it."""
     workspace.finish(
@@ -181,7 +200,6 @@ def finish(
             num_items=outcome.num_items,
             num_reused=outcome.num_reused,
         ),
-        made,
     )
 
 
@@ -219,10 +237,11 @@ def wanted_matches(workspace: Workspace, matcher: cfg.Matcher | None = None) -> 
         record = workspace.record_of("matches")
         # Version 0.1.0 knew one matcher and did not record it.
         matcher = cfg.Matcher(record.config.get("matcher", "nearest")) if record else cfg.Matcher.NEAREST
-    algorithm = _MATCHER_VERSIONS[matcher]
-    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(read_index(workspace).names)
+    algorithm = cfg.encoded(_MATCHER_VERSIONS[matcher])
+    fingerprints = features_of(workspace).fingerprints(read_index(workspace).names)
+    texts = {name: cfg.encoded(fingerprint) for name, fingerprint in fingerprints.items()}
     return {
-        pair: cfg.config_hash(algorithm, fingerprints[pair[0]], fingerprints[pair[1]])
+        pair: cfg.hash_encoded(algorithm, texts[pair[0]], texts[pair[1]])
         for pair in read_pairs(workspace).pairs
     }
 
@@ -243,7 +262,7 @@ def photos_left_out(workspace: Workspace, names: Iterable[str]) -> set[str]:
     WorkspaceError
         If the features cannot be read.
     """
-    fingerprints = ItemStore(workspace.features, FEATURES).fingerprints(names)
+    fingerprints = features_of(workspace).fingerprints(names)
     return {name for name, fingerprint in fingerprints.items() if fingerprint.startswith(_LEFT_OUT)}
 
 

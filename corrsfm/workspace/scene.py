@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from corrsfm.types import Camera, Features, Matches, Pair
 from corrsfm.workspace.folder import Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
+from corrsfm.workspace.items import PrunedMatches
 from corrsfm.workspace.lists import read_index, read_pairs
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -30,7 +30,9 @@ def open_workspace(folder: Path | str) -> Scene:
     WorkspaceError
         If it is not a workspace, or photos have not been indexed yet.
     """
-    return Scene(Workspace(Path(folder)))
+    workspace = Workspace(Path(folder))
+    workspace.modernise()
+    return Scene(workspace)
 
 
 class Scene:
@@ -76,15 +78,15 @@ class Scene:
         WorkspaceError
             If they are missing or cannot be read.
         """
-        return ItemStore(self._workspace.features, FEATURES).read(photo)
+        return features_of(self._workspace).read(photo)
 
     def matches(self, pair: Pair) -> Matches:
         """Putative matches of a pair; raises as `features`."""
-        return ItemStore(self._workspace.matches, MATCHES).read(pair)
+        return matches_of(self._workspace).read(pair)
 
     def kept(self, pair: Pair) -> PrunedMatches:
         """Matches of a pair that passed pruning; raises as `features`."""
-        return ItemStore(self._workspace.pruned, PRUNED).read(pair)
+        return pruned_of(self._workspace).read(pair)
 
     def models(self) -> list[pycolmap.Reconstruction]:
         """The reconstructed models, the largest first.
@@ -94,7 +96,7 @@ class Scene:
         WorkspaceError
             If there are none, they are older than the matches, or one cannot be read.
         """
-        from corrsfm.colmap.models import read_models
+        from corrsfm.workspace.models import models_of
 
         self._workspace.require("models")
-        return read_models(self._workspace.sparse)
+        return models_of(self._workspace)

@@ -1,121 +1,111 @@
-"""Items of one kind in an HDF5 file, with a journal that survives a kill.
+"""Items of one kind in one SQLite file, each with the fingerprint of what it was made from and a checksum.
 
-Finished items go to a journal next to the file (`corrsfm.workspace.journal`); the file itself is written in
-one go and renamed into place when its stage is complete. `corrsfm.workspace.hloc` says what lies in it.
+An item is safe from a kill as soon as it was added, and from a power cut two seconds later: while a stage
+runs, SQLite's write-ahead log takes the items, and it is flushed to the disk from time to time. What is there
+already is not written again, however many items a scene has. Between runs the file is a plain database
+without a log, which may be copied and read on a read-only disk.
 """
 
 from __future__ import annotations
 
-import errno
-import hashlib
+import contextlib
+import itertools
+import json
+import logging
+import os
+import shlex
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from pathlib import Path
-from typing import Generic
+from typing import Any, Generic
 
-import h5py
-import numpy as np
-
-from corrsfm.errors import WorkspaceError
-from corrsfm.files import atomic_path
-from corrsfm.workspace.hloc import Arrays, Attributes, K, Kind, T
-from corrsfm.workspace.journal import Journal
+from corrsfm.errors import DamageError, InputError, WorkspaceError, first_few
+from corrsfm.files import atomic_path, share_file, sync_folder
+from corrsfm.workspace.items import Arrays, Attributes, K, Kind, T
+from corrsfm.workspace.rows import (
+    APPLICATION_ID,
+    FORMAT_VERSION,
+    WHOLE_ROWS,
+    create_tables,
+    delete_item,
+    insert_row,
+    is_intact,
+    make_row,
+    readable_rows,
+    transaction,
+    unpack,
+)
 
 __all__ = ["ItemStore"]
 
-FORMAT_VERSION = 1
-_SECONDS = "seconds"
+logger = logging.getLogger("corrsfm")
 
+SYNC_SECONDS = 2.0
+KEYS_AT_ONCE = 500
 
-def _why_unreadable(error: OSError) -> str:
-    """Explain why HDF5 could not read a file, so that nobody deletes a whole one."""
-    if error.errno is None:
-        # HDF5 objects to the content: no signature, truncated, a wrong byte.
-        return f"not a readable HDF5 file ({error}); delete it and run again"
-    if "unable to lock" in str(error):
-        if error.errno in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EACCES):
-            cause = "in use by another program; close it there and run again"
-        else:
-            cause = "cannot be locked; run again"
-        return f"{cause}, on a file system without locks with HDF5_USE_FILE_LOCKING=FALSE in the environment"
-    if isinstance(error, PermissionError):
-        return "may not be read; check the permissions of the file and its folder"
-    return f"cannot be read ({error}); check the disk and run again"
-
-
-def _own(dataset: h5py.Dataset, file: h5py.File) -> h5py.Dataset:
-    """A dataset that lies in a file; refuses one that would be read from another, which may be any file."""
-    if dataset.is_virtual or dataset.external or dataset.file.filename != file.filename:
-        raise ValueError("its values lie in another file")
-    return dataset
+_NOT_DAMAGE = {
+    ("SQLITE_BUSY", "SQLITE_LOCKED"): (
+        "in use by another program ({}); close it there and run again, finished work is kept"
+    ),
+    ("SQLITE_READONLY", "SQLITE_PERM", "SQLITE_CANTOPEN", "SQLITE_AUTH"): (
+        "cannot be opened ({}); check the permissions of the file and its folder and run again"
+    ),
+    ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_NOMEM"): (
+        "the disk is full or failing ({}); free some space and run again, finished work is kept"
+    ),
+}
 
 
 class ItemStore(Generic[K, T]):
-    """Items of one kind in an HDF5 file, with a journal of those finished since it was written.
+    """Items of one kind.
+
+    Reading is safe from several threads; one process at a time may write.
 
     Parameters
     ----------
     path : Path
-        The HDF5 file; the journal lies beside it with the suffix ``.journal``.
     kind : Kind
+    remedy : str
+        The command that makes the items, for messages.
+    seal : str, optional
+        What `commit` was given when the file was finished; another file in its place is refused.
     """
 
-    def __init__(self, path: Path, kind: Kind[K, T]) -> None:
+    def __init__(self, path: Path, kind: Kind[K, T], *, remedy: str = "", seal: str | None = None) -> None:
         self.path = path
         self.kind = kind
-        self.journal = Journal(path.with_suffix(path.suffix + ".journal"))
+        self._remedy = remedy or "the step that makes it"
+        self._seal = seal
+        self._writing: sqlite3.Connection | None = None
+        self._synced = 0.0
+        # As long as it is not known.
+        self._is_sealed = True
 
     # reading ------------------------------------------------------------------------------------------------
 
-    @contextmanager
-    def _open(self) -> Iterator[h5py.File]:
-        try:
-            file = h5py.File(self.path, "r")
-        except FileNotFoundError as error:
-            raise WorkspaceError(f"{self.path}: missing; run the step that makes it") from error
-        except OSError as error:
-            raise WorkspaceError(f"{self.path}: {_why_unreadable(error)}") from error
-        with file:
-            version = file.attrs.get("version", FORMAT_VERSION)
-            if version != FORMAT_VERSION:
-                raise WorkspaceError(
-                    f"{self.path}: format version {version}, this corrsfm reads {FORMAT_VERSION}"
-                )
-            yield file
-
-    @contextmanager
+    @contextlib.contextmanager
     def reader(self) -> Iterator[Callable[[K], T]]:
         """Open the file once and yield a function that reads an item by key.
 
         Raises
         ------
         WorkspaceError
-            If the file is missing or unreadable, or (from the function) if it holds no such item.
+            If the file is missing, unreadable or not the one that the stage wrote, or (from the function) if
+            it holds no such item or a damaged one.
         """
-        with self._open() as file:
+        lock = threading.Lock()
+        with self._reading() as connection:
 
             def read(key: K) -> T:
-                group = self._group(file, key)
-                try:
-                    return self.kind.decode(
-                        {
-                            name: _own(value, file)[()]
-                            for name, value in group.items()
-                            if isinstance(value, h5py.Dataset)
-                        },
-                        group.attrs,
-                    )
-                except OSError as error:
-                    raise WorkspaceError(f"{self.path}: {key}: {_why_unreadable(error)}") from error
-                except KeyError as error:
-                    raise WorkspaceError(
-                        f"{self.path}: {key} lacks {error}; move the file away and run again"
-                    ) from error
-                except ValueError as error:
-                    raise WorkspaceError(
-                        f"{self.path}: {key}: {error}; move the file away and run again"
-                    ) from error
+                text = self.kind.key(key)
+                with lock, self._errors():
+                    row = connection.execute(f"{WHOLE_ROWS} WHERE key = ?", (text,)).fetchone()
+                if row is None:
+                    raise self._lacks(text)
+                return self._decoded(row)
 
             yield read
 
@@ -125,163 +115,414 @@ class ItemStore(Generic[K, T]):
             return read(key)
 
     def fingerprints(self, keys: Iterable[K]) -> dict[K, str]:
-        """Fingerprints of items in the file; of items that another tool wrote, a hash of what they hold.
+        """Fingerprints of items.
 
         Raises
         ------
         WorkspaceError
             If the file is missing or unreadable, or holds no such item.
         """
-        with self._open() as file:
-            return {key: self._fingerprint(file, key) for key in keys}
+        found = {}
+        with self._reading() as connection:
+            for key, fingerprint in self._look_up(connection, keys):
+                if fingerprint is None:
+                    raise self._lacks(self.kind.key(key))
+                found[key] = fingerprint
+        return found
 
     def held(self, keys: Iterable[K]) -> dict[K, str]:
         """Fingerprints of those of the items that the file holds; see `fingerprints`."""
-        with self._open() as file:
-            return {key: self._fingerprint(file, key) for key in keys if self.kind.group(key) in file}
+        with self._reading() as connection:
+            found = self._look_up(connection, keys)
+            return {key: fingerprint for key, fingerprint in found if fingerprint is not None}
 
     def attributes(self, keys: Iterable[K]) -> Iterator[tuple[K, Attributes]]:
-        """Attributes of items, read without their datasets.
+        """Attributes of items, read without their arrays.
 
         Raises
         ------
         WorkspaceError
             If the file is missing or unreadable, or holds no such item.
         """
-        with self._open() as file:
+        query = "SELECT key, fingerprint, attributes, seconds, checksum FROM items WHERE key = ?"
+        with self._reading() as connection:
             for key in keys:
-                yield key, dict(self._group(file, key).attrs)
+                text = self.kind.key(key)
+                with self._errors():
+                    row = connection.execute(query, (text,)).fetchone()
+                if row is None:
+                    raise self._lacks(text)
+                if not is_intact(row):
+                    raise self._damaged(f"the checksum of {_shown(text)}")
+                yield key, json.loads(row[2])
 
-    def _group(self, file: h5py.File, key: K) -> h5py.Group:
-        group = file.get(self.kind.group(key))
-        if group is None:
-            raise WorkspaceError(f"{self.path}: holds nothing for {key}; run the step that makes it again")
-        return group
+    def counts(self, name: str) -> dict[str, int]:
+        """A whole number of every item's attributes, by the text of its key; not held against checksums.
 
-    def _fingerprint(self, file: h5py.File, key: K) -> str:
-        group = self._group(file, key)
-        if "fingerprint" in group.attrs:
-            return str(group.attrs["fingerprint"])
-        digest = hashlib.sha256()
-        for name in sorted(group):
-            if isinstance(group[name], h5py.Dataset):
-                digest.update(name.encode())
-                digest.update(np.ascontiguousarray(group[name][()]).tobytes())
-        return digest.hexdigest()
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing or unreadable.
+        """
+        query = "SELECT key, json_extract(attributes, '$.' || ?) FROM items"
+        with self._reading() as connection, self._errors():
+            return {key: int(value or 0) for key, value in connection.execute(query, (name,))}
 
     def finished(self, wanted: Mapping[K, str]) -> set[K]:
-        """Keys whose item is already there with the wanted fingerprint, in the file or the journal."""
-        found: set[K] = set()
-        if self.path.exists():
-            with self._open() as file:
-                for key, fingerprint in wanted.items():
-                    if self.kind.group(key) in file and self._fingerprint(file, key) == fingerprint:
-                        found.add(key)
-        waiting = self.journal.fingerprints()
-        found |= {
-            key for key, fingerprint in wanted.items() if waiting.get(self.kind.group(key)) == fingerprint
-        }
-        return found
+        """Keys whose item is there with the wanted fingerprint."""
+        if not self.path.exists():
+            return set()
+        with self._reading(sealed=False) as connection:
+            found = self._look_up(connection, wanted)
+            return {key for key, fingerprint in found if fingerprint == wanted[key]}
+
+    def seal(self) -> str | None:
+        """What `commit` was given last; None if it was not called yet."""
+        if not self.path.exists():
+            return None
+        with self._reading(sealed=False) as connection, self._errors():
+            return self._about(connection).get("seal")
+
+    def seconds(self) -> float:
+        """Seconds that the items took to make, over all runs."""
+        with self._reading(sealed=False) as connection, self._errors():
+            return float(connection.execute("SELECT total(seconds) FROM items").fetchone()[0])
+
+    def find_damage(self) -> list[str]:
+        """Keys of items that are not as they were written; reads the whole file and changes nothing.
+
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing or not an item store, or its tables cannot be read to the end.
+        """
+        damaged = []
+        with self._reading(sealed=False) as connection, self._errors():
+            (problem,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if problem != "ok":
+                raise sqlite3.DatabaseError(problem)
+            orphans = "SELECT key FROM items WHERE number NOT IN (SELECT number FROM arrays)"
+            damaged += [str(key) for (key,) in connection.execute(orphans)]
+            for row in connection.execute(WHOLE_ROWS):
+                try:
+                    self._decoded(row)
+                except DamageError:
+                    damaged.append(str(row[0]))
+        return damaged
+
+    @contextlib.contextmanager
+    def _reading(self, *, sealed: bool = True) -> Iterator[sqlite3.Connection]:
+        """A connection to read from: that of the writer if there is one."""
+        if self._writing is not None:
+            yield self._writing
+            return
+        if not self.path.exists():
+            raise WorkspaceError(f"{self.path}: missing; run: {self._remedy}")
+        with self._errors():
+            if not self.path.is_file():
+                raise sqlite3.DatabaseError("is no file")
+        self._merge_log()
+        # Without a log beside it nobody writes, and no lock is needed, which some file systems lack.
+        uri = f"{self.path.absolute().as_uri()}?{'mode=ro' if self._has_log() else 'mode=ro&immutable=1'}"
+        with self._errors():
+            connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        with contextlib.closing(connection):
+            with self._errors():
+                about = self._about(connection)
+            if sealed and self._seal is not None and about.get("seal") != self._seal:
+                raise WorkspaceError(
+                    f"{self.path}: is not the file that its step wrote; run: {self._remedy} --verify"
+                )
+            yield connection
+
+    def _merge_log(self) -> None:
+        """Put what a killed process wrote last into the file, where the file may be written."""
+        if self._has_log() and os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK):
+            self._writer()
+            self.close()
+
+    def _has_log(self) -> bool:
+        return any(self._beside(suffix).exists() for suffix in ("-wal", "-journal"))
+
+    def _about(self, connection: sqlite3.Connection) -> dict[str, str]:
+        (application,) = connection.execute("PRAGMA application_id").fetchone()
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        if application != APPLICATION_ID:
+            raise sqlite3.DatabaseError("is not a file of corrsfm's items")
+        # That of the workspace was read before: a file of another corrsfm does not get here.
+        if version != FORMAT_VERSION:
+            raise sqlite3.DatabaseError(f"format version {version}, expected {FORMAT_VERSION}")
+        about = {str(name): str(value) for name, value in connection.execute("SELECT name, value FROM about")}
+        if about.get("kind") != self.kind.label:
+            raise sqlite3.DatabaseError(f"holds {about.get('kind')}, expected {self.kind.label}")
+        return about
+
+    def _look_up(self, connection: sqlite3.Connection, keys: Iterable[K]) -> Iterator[tuple[K, str | None]]:
+        """Keys with the fingerprints of their items, None where there is no item."""
+        keys = iter(keys)
+        # Many at once: a scene may have millions.
+        while some := {key: self.kind.key(key) for key in itertools.islice(keys, KEYS_AT_ONCE)}:
+            marks = ", ".join("?" * len(some))
+            query = f"SELECT key, fingerprint FROM items WHERE key IN ({marks})"
+            with self._errors():
+                found = dict(connection.execute(query, tuple(some.values())))
+            for key, text in some.items():
+                yield key, found.get(text)
+
+    def _checked(self, row: tuple[Any, ...]) -> tuple[Arrays, Attributes]:
+        """Arrays and attributes of a row whose checksum is right."""
+        if not is_intact(row):
+            raise self._damaged(f"the checksum of {_shown(row[0])}")
+        return unpack(row[5], row[6]), json.loads(row[2])
+
+    def _decoded(self, row: tuple[Any, ...]) -> T:
+        """The item of a row whose checksum is right, and whose arrays make one."""
+        arrays, attributes = self._checked(row)
+        try:
+            return self.kind.decode(arrays, attributes)
+        except (InputError, AttributeError, LookupError, TypeError, ValueError) as error:
+            raise self._damaged(f"{_shown(row[0])}: {error}") from error
+
+    def _lacks(self, key: str) -> WorkspaceError:
+        return WorkspaceError(f"{self.path}: holds nothing for {_shown(key)}; run: {self._remedy} --verify")
+
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        """Say what SQLite's errors mean for the user, so that nobody deletes a whole file."""
+        try:
+            yield
+        except sqlite3.Error as error:
+            name = getattr(error, "sqlite_errorname", "")
+            for beginnings, text in _NOT_DAMAGE.items():
+                if name.startswith(beginnings):
+                    raise WorkspaceError(f"{self.path}: {text.format(error)}") from error
+            raise self._damaged(error) from error
+
+    def _damaged(self, what: object) -> DamageError:
+        return DamageError(f"{self.path}: damaged ({what}); run: {self._remedy} --verify")
 
     # writing ------------------------------------------------------------------------------------------------
 
     def add(self, key: K, fingerprint: str, item: T, seconds: float = 0.0) -> None:
-        """Put an item, and the seconds it took, into the journal; it is safe when this returns.
+        """Write an item, and the seconds it took to make; no kill can take it when this returns.
 
         Raises
         ------
         WorkspaceError
-            If the disk is full or the journal cannot be written.
+            If the disk is full or the file cannot be written.
         """
-        arrays, attributes = self.kind.encode(item)
-        self.journal.add(self.kind.group(key), fingerprint, arrays, {**attributes, _SECONDS: seconds})
+        row = make_row(self.kind.key(key), fingerprint, *self.kind.encode(item), seconds)
+        with self._changing() as connection:
+            insert_row(connection, row)
+        if time.monotonic() - self._synced >= SYNC_SECONDS:
+            self._sync()
 
-    def commit(
-        self, wanted: Mapping[K, str], progress: Callable[[Iterable[K]], Iterable[K]] = iter
-    ) -> tuple[int, float]:
-        """Make the HDF5 file hold exactly the wanted items, from itself and the journal; all or nothing.
+    def absorb(self, other: Path) -> int:
+        """Copy every item of another store of this kind into this one, all or nothing; their number.
+
+        Raises
+        ------
+        WorkspaceError
+            If the other file is damaged or of another kind, or the disk is full.
+        """
+        source = ItemStore(other, self.kind, remedy=self._remedy)
+        num = 0
+        with source._reading(sealed=False) as reading, self._changing() as connection:
+            for row in reading.execute(WHOLE_ROWS):
+                source._checked(row)
+                insert_row(connection, row)
+                num += 1
+        self._sync()
+        return num
+
+    def commit(self, wanted: Mapping[K, str], seal: str = "", *, known: Set[K] = frozenset()) -> None:
+        """Finish the file: it then holds exactly the wanted items, on the disk.
 
         Parameters
         ----------
         wanted : mapping
             Key → fingerprint.
-        progress : callable
-            Passes the keys on one by one as they are written; for a progress bar.
-
-        Returns
-        -------
-        num_new : int
-            Items that came from the journal; the others were in the file before.
-        seconds : float
-            That these took to make, over all runs.
+        seal : str
+            Kept in the file, to tell it from others.
+        known : set
+            Of them, those that `finished` has found: they are not looked up again.
 
         Raises
         ------
         WorkspaceError
-            If an item is in neither, or the disk is full.
+            If an item is missing, or the disk is full; the items stay as they are then.
         """
-        self._require_space()
+        connection = self._writer()
+        for key, fingerprint in self._look_up(connection, (key for key in wanted if key not in known)):
+            if fingerprint != wanted[key]:
+                raise WorkspaceError(
+                    f"{self.path}: {_shown(self.kind.key(key))} was never finished; run again"
+                )
+        with self._errors(), transaction(connection):
+            (num,) = connection.execute("SELECT count(*) FROM items").fetchone()
+            if num != len(wanted):
+                texts = {self.kind.key(key) for key in wanted}
+                held = connection.execute("SELECT key FROM items").fetchall()
+                for key in [key for (key,) in held if key not in texts]:
+                    delete_item(connection, key)
+            connection.execute("INSERT OR REPLACE INTO about VALUES ('seal', ?)", (seal,))
+        with self._errors():
+            self._give_back_space(connection)
+        self.close()
+
+    def _give_back_space(self, connection: sqlite3.Connection) -> None:
+        """Shrink a file of which more than half is left from items that are gone."""
+        (num_free,) = connection.execute("PRAGMA freelist_count").fetchone()
+        (num_pages,) = connection.execute("PRAGMA page_count").fetchone()
+        if num_free > num_pages / 2:
+            # It needs room for a copy; without it the file stays as it is.
+            with contextlib.suppress(sqlite3.OperationalError):
+                connection.execute("VACUUM")
+
+    def mend(self) -> list[str]:
+        """Drop damaged items; of a damaged file the whole items are kept, and the old one beside it.
+
+        Returns
+        -------
+        list of str
+            What was lost, for people.
+        """
+        if not self.path.exists():
+            return []
         try:
-            with atomic_path(self.path) as temporary, h5py.File(temporary, "w") as target:
-                target.attrs["format"] = f"corrsfm-{self.kind.label}"
-                target.attrs["version"] = FORMAT_VERSION
-                seconds = self._fill(target, wanted, progress)
-        # HDF5 notices some failures of writing only when it closes the file, which is a RuntimeError.
-        except (OSError, RuntimeError) as error:
+            damaged = self.find_damage()
+        except DamageError as error:
+            return [self._rebuild(error)]
+        if not damaged:
+            return []
+        with self._changing() as connection:
+            for key in damaged:
+                delete_item(connection, key)
+        return [f"{self.path}: damaged items are made again: {first_few([_shown(key) for key in damaged])}"]
+
+    def _rebuild(self, error: DamageError) -> str:
+        """Put a file with the whole items of a damaged one in its place, and the damaged one aside."""
+        self._drop_connection()
+        aside = self.path.with_name(f"{self.path.name}.damaged")
+        num = 0
+        # The damaged file keeps its name until the new one is whole: an interruption must not cost its items.
+        with atomic_path(self.path) as new:
+            with self._errors(), self._creating(new) as connection, transaction(connection):
+                for row in self._rows_left():
+                    with contextlib.suppress(DamageError):
+                        self._checked(row)
+                        insert_row(connection, row)
+                        num += 1
+            self._put_aside(aside)
+        kept = f"{num} whole items are kept, and the old file as {aside.name}"
+        return f"{self.path}: damaged ({error.__cause__}); {kept}"
+
+    def _put_aside(self, aside: Path) -> None:
+        """Give the damaged file and its logs another name; a file keeps its own too, until it is replaced."""
+        try:
+            if self.path.is_file() and not aside.is_dir():
+                share_file(self.path, aside)
+            else:
+                os.replace(self.path, aside)
+            for suffix in ("-wal", "-shm", "-journal"):
+                with contextlib.suppress(FileNotFoundError):
+                    os.replace(self._beside(suffix), aside.with_name(aside.name + suffix))
+        except (IsADirectoryError, NotADirectoryError) as problem:
+            raise WorkspaceError(f"{aside}: is in the way; move it away and run again") from problem
+
+    def _rows_left(self) -> Iterator[tuple[Any, ...]]:
+        if not self.path.is_file():
+            return
+        try:
+            yield from readable_rows(self.path)
+        except PermissionError as error:
             raise WorkspaceError(
-                f"{self.path}: cannot be written ({error}); free some disk space and run again, "
-                "finished work is kept"
+                f"{self.path}: damaged, and cannot be mended ({error.strerror}); make it writable, with: "
+                f"chmod u+w {shlex.quote(str(self.path))}"
             ) from error
-        self.discard_journal()
-        return len(seconds), sum(seconds)
-
-    def _require_space(self) -> None:
-        # HDF5 may crash the process when the disk fills up. The new file is no larger than its sources.
-        needed = self.journal.num_bytes() + (self.path.stat().st_size if self.path.exists() else 0)
-        free = shutil.disk_usage(self.path.parent).free
-        if free < needed:
-            raise WorkspaceError(
-                f"{self.path}: writing it needs {needed / 1e6:.0f} MB, {free / 1e6:.0f} MB are free; "
-                "free some disk space and run again, finished work is kept"
-            )
-
-    def _fill(
-        self,
-        target: h5py.File,
-        wanted: Mapping[K, str],
-        progress: Callable[[Iterable[K]], Iterable[K]],
-    ) -> list[float]:
-        """Write all items; the seconds of those from the journal."""
-        seconds = []
-        with self._open() if self.path.exists() else nullcontext() as source:
-            for key in progress(wanted):
-                name, fingerprint = self.kind.group(key), wanted[key]
-                item = self.journal.read(name, fingerprint)
-                if item is not None:
-                    arrays, attributes = item
-                    # Not for the file: the same input gives the same bytes.
-                    seconds.append(float(attributes.pop(_SECONDS, 0.0)))
-                    self._write_group(target, name, fingerprint, arrays, attributes)
-                elif source is not None and name in source and self._fingerprint(source, key) == fingerprint:
-                    source.copy(source[name], target, name=name, shallow=False)
-                else:
-                    raise WorkspaceError(f"{self.path}: {key} was never finished; run again")
-        return seconds
-
-    @staticmethod
-    def _write_group(
-        target: h5py.File, name: str, fingerprint: str, arrays: Arrays, attributes: Attributes
-    ) -> None:
-        group = target.create_group(name)
-        group.attrs["fingerprint"] = fingerprint
-        group.attrs.update(attributes)
-        for entry, values in arrays.items():
-            group.create_dataset(entry, data=values)
-
-    def discard_journal(self) -> None:
-        """Forget everything that is only in the journal."""
-        self.journal.discard()
 
     def close(self) -> None:
-        """Close the journal; its items stay for the next run."""
-        self.journal.close()
+        """Make everything safe on the disk and end writing; the items stay for the next run.
+
+        Raises
+        ------
+        WorkspaceError
+            If the disk is full.
+        """
+        if self._writing is None:
+            return
+        try:
+            with self._errors():
+                # Leaving the log's mode merges it into the file, and flushes that.
+                self._writing.execute("PRAGMA synchronous = FULL")
+                self._writing.execute("PRAGMA journal_mode = DELETE")
+        finally:
+            self._drop_connection()
+        sync_folder(self.path.parent)
+
+    @contextlib.contextmanager
+    def _changing(self) -> Iterator[sqlite3.Connection]:
+        """A transaction after which the file is no longer what `commit` finished."""
+        connection = self._writer()
+        with self._errors(), transaction(connection):
+            if self._is_sealed:
+                connection.execute("DELETE FROM about WHERE name = 'seal'")
+            yield connection
+        self._is_sealed = False
+
+    def _drop_connection(self) -> None:
+        if self._writing is not None:
+            self._writing.close()
+            self._writing = None
+            self._is_sealed = True
+
+    def _sync(self) -> None:
+        with self._errors():
+            self._writer().execute("PRAGMA wal_checkpoint(PASSIVE)")
+        self._synced = time.monotonic()
+
+    def _writer(self) -> sqlite3.Connection:
+        if self._writing is None:
+            if self.path.is_symlink():
+                raise WorkspaceError(f"{self.path}: is a link; replace it by the file, nothing was written")
+            self._prepare()
+            with self._errors():
+                connection = sqlite3.connect(self.path, isolation_level=None, check_same_thread=False)
+            try:
+                with self._errors():
+                    # One process writes, so the log needs no shared memory, which network disks lack.
+                    connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+                    connection.execute("PRAGMA journal_mode = WAL")
+                    connection.execute("PRAGMA synchronous = NORMAL")
+                    self._about(connection)
+            except BaseException:
+                connection.close()
+                raise
+            self._writing, self._synced = connection, time.monotonic()
+        return self._writing
+
+    def _prepare(self) -> None:
+        """See to it that there is a file of this store's own."""
+        if not self.path.exists():
+            with atomic_path(self.path) as new, self._errors(), self._creating(new):
+                pass
+        # Other workspaces that read it by another name keep what they have.
+        elif self.path.stat().st_nlink > 1:
+            with atomic_path(self.path) as copy:
+                shutil.copy2(self.path, copy)
+
+    @contextlib.contextmanager
+    def _creating(self, new: Path) -> Iterator[sqlite3.Connection]:
+        """A new file of no items that is not in place yet."""
+        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
+            # No file beside it.
+            connection.execute("PRAGMA journal_mode = MEMORY")
+            create_tables(connection, self.kind.label)
+            yield connection
+
+    def _beside(self, suffix: str) -> Path:
+        return self.path.with_name(self.path.name + suffix)
+
+
+def _shown(key: object) -> str:
+    return str(key).replace("\t", " – ")

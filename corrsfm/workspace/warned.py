@@ -7,16 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import logging
-import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Concatenate, ParamSpec
 
 from corrsfm.errors import WorkspaceError
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_write_json, read_json
 from corrsfm.workspace.folder import Workspace
+from corrsfm.workspace.heard import ThreadWarnings, listening
 from corrsfm.workspace.resume import StageOutcome
 
 __all__ = ["BEFORE_STAGES", "collect_warnings", "keep_warnings", "keeps_warnings", "read_warnings"]
@@ -33,19 +32,15 @@ logger = logging.getLogger("corrsfm")
 P = ParamSpec("P")
 
 
-class _Collector(logging.Handler):
+class _Collector(ThreadWarnings):
     """Keeps the different warnings of one thread, the first hundred in full and of the others the number."""
 
     def __init__(self) -> None:
-        super().__init__(logging.WARNING)
+        super().__init__()
         self.messages: list[str] = []
         self._seen: set[str] = set()
-        self._thread = threading.get_ident()
 
-    def emit(self, record: logging.LogRecord) -> None:
-        # Another thread may work in another workspace.
-        if record.thread != self._thread:
-            return
+    def hear(self, record: logging.LogRecord) -> None:
         message = record.getMessage()
         if len(message) > MAX_CHARACTERS:
             message = message[:MAX_CHARACTERS] + " …"
@@ -69,12 +64,8 @@ def collect_warnings() -> Iterator[list[str]]:
     list of str
         Grows as warnings come: at most 100 different ones of 2000 characters, then how many there were more.
     """
-    collector = _Collector()
-    logger.addHandler(collector)
-    try:
+    with listening(_Collector()) as collector:
         yield collector.messages
-    finally:
-        logger.removeHandler(collector)
 
 
 def keeps_warnings(
@@ -117,7 +108,7 @@ def keep_warnings(path: Path, stage: str, messages: list[str]) -> None:
 def read_warnings(path: Path) -> dict[str, list[str]]:
     """Stage → its warnings; empty if there is no such file or it is damaged: it holds no results."""
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(path)
     except (OSError, ValueError):
         return {}
     if not isinstance(values, dict):

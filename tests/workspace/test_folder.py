@@ -3,7 +3,6 @@
 import errno
 import fcntl
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -169,7 +168,7 @@ def test_a_workspace_without_its_manifest_goes_on(workspace: Workspace) -> None:
     for path in (workspace.images_json, workspace.database):
         path.touch()
     workspace.manifest.write_text("{")
-    with pytest.raises(WorkspaceError, match="delete this file alone and run"):
+    with pytest.raises(WorkspaceError, match="remove it alone, with: rm -r .*; then run the commands"):
         Workspace(workspace.root, create=True)
     workspace.manifest.unlink()
     assert Workspace(workspace.root, create=True).record_of("images") is None
@@ -215,18 +214,6 @@ def test_a_second_process_cannot_lock_a_workspace(workspace: Workspace) -> None:
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert "another corrsfm works in this workspace" in output
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "locked\n"
-
-
-@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP])
-def test_a_file_system_without_locks_is_used_with_a_warning(
-    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
-) -> None:
-    def refuse(*arguments: object) -> None:
-        raise OSError(number, os.strerror(number))
-
-    monkeypatch.setattr(fcntl, "flock", refuse)
-    with workspace.lock():
-        assert "this file system has no locks" in caplog.text
 
 
 def test_a_failing_lock_is_not_taken_for_another_process(

@@ -10,12 +10,13 @@ import pytest
 from corrsfm import config as cfg
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import PRUNED, PrunedMatches
+from corrsfm.workspace.items import PrunedMatches
 from corrsfm.workspace.resume import complete
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import pruned_of
 
 A, B, C = ("a", "b"), ("a", "c"), ("b", "c")
 SECONDS_EACH = 10.0
+ONE, TWO = cfg.PruneMethod.RATIO, cfg.PruneMethod.LORANSAC
 
 
 class Work:
@@ -27,7 +28,9 @@ class Work:
         self.made: list[Pair] = []
         monkeypatch.setattr(time, "monotonic", lambda: self.now)
 
-    def run(self, wanted: dict[Pair, str], *, name: str = "one", stop_at: Pair | None = None) -> float:
+    def run(
+        self, wanted: dict[Pair, str], *, name: cfg.PruneMethod = ONE, stop_at: Pair | None = None
+    ) -> float:
         """The seconds on record afterwards."""
 
         def produce(missing: list[Pair]) -> Iterator[tuple[Pair, PrunedMatches]]:
@@ -39,19 +42,16 @@ class Work:
                 indices = np.zeros((1, 2), np.int32)
                 yield key, PrunedMatches(indices=indices, scores=np.ones(1, np.float32), num_putative=1)
 
-        path = self.workspace.pruned_by(name)
-        path.parent.mkdir(exist_ok=True)
         complete(
             self.workspace,
             "pruned matches",
-            ItemStore(path, PRUNED),
+            pruned_of(self.workspace, name),
             wanted,
             produce,
-            cfg.PruneConfig(),
+            cfg.PruneConfig(method=name),
             inputs={"matches": name},
             overwrite=False,
             unit="pair",
-            shown_as=self.workspace.pruned,
         )
         record = self.workspace.record_of("pruned matches")
         assert record is not None
@@ -81,11 +81,11 @@ def test_what_was_kept_counts_its_share_and_what_was_made_again_its_own_time(wor
 
 def test_another_file_in_between_costs_neither_its_items_nor_their_seconds(work: Work) -> None:
     wanted = {A: "1", B: "1"}
-    assert work.run(wanted, name="one") == 20.0
+    assert work.run(wanted, name=ONE) == 20.0
     before = work.workspace.pruned.read_bytes()
-    assert work.run({A: "2"}, name="two") == 10.0
+    assert work.run({A: "2"}, name=TWO) == 10.0
     assert work.workspace.pruned.read_bytes() != before
-    assert work.run(wanted, name="one") == 20.0
+    assert work.run(wanted, name=ONE) == 20.0
     assert work.workspace.pruned.read_bytes() == before
     assert work.made == [A, B, A]
 
@@ -93,7 +93,7 @@ def test_another_file_in_between_costs_neither_its_items_nor_their_seconds(work:
 def test_an_unfinished_file_waits_for_its_turn(work: Work) -> None:
     wanted = {A: "1", B: "1"}
     with pytest.raises(KeyboardInterrupt):
-        work.run(wanted, name="one", stop_at=B)
-    work.run(wanted, name="two")
-    assert work.run(wanted, name="one") == 20.0
+        work.run(wanted, name=ONE, stop_at=B)
+    work.run(wanted, name=TWO)
+    assert work.run(wanted, name=ONE) == 20.0
     assert work.made == [A, A, B, B]

@@ -1,0 +1,64 @@
+"""What lies at the places of a workspace's own files: no link elsewhere, no pipe, no folder for a file.
+
+A workspace may come from anybody. What is written there must not land in a file outside, and what is read
+must come to an end.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import stat
+from collections.abc import Collection
+from pathlib import Path
+
+from corrsfm.errors import WorkspaceError
+
+__all__ = ["check_entries"]
+
+
+def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
+    """Refuse links, special files, and folders and files in each other's place, where a workspace writes.
+
+    Parameters
+    ----------
+    root : Path
+    own : collection of str
+        Names of files and folders in it; only files have a suffix. A folder is looked through. Empty for
+        everything.
+    may_link : bool
+        Whether links are fine, because nothing is written.
+
+    Raises
+    ------
+    WorkspaceError
+        Naming the first one.
+    """
+    with os.scandir(root) as entries:
+        for entry in entries:
+            # Beside a database, SQLite keeps its log.
+            if own and entry.name.rpartition("-")[0] not in own and entry.name not in own:
+                continue
+            mode = entry.stat(follow_symlinks=False).st_mode
+            if stat.S_ISLNK(mode) and not may_link:
+                raise WorkspaceError(
+                    f"{entry.path}: is a link, and nothing is written through links; put what it leads to in "
+                    f"its place, or run: {_removal(entry.path)}"
+                )
+            expected = "file" if Path(entry.name).suffix else "folder"
+            if entry.name in own and not stat.S_ISLNK(mode) and stat.S_ISDIR(mode) != (expected == "folder"):
+                raise WorkspaceError(
+                    f"{entry.path}: is in the place of a {expected} of the workspace; move it away, or run: "
+                    f"{_removal(entry.path)}"
+                )
+            if stat.S_ISDIR(mode):
+                check_entries(Path(entry.path), (), may_link=may_link)
+            elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+                raise WorkspaceError(
+                    f"{entry.path}: is a pipe or device, expected a file; run: {_removal(entry.path)}"
+                )
+
+
+def _removal(path: str) -> str:
+    is_folder = os.path.isdir(path) and not os.path.islink(path)
+    return shlex.join(["rm", *(["-r"] if is_folder else []), path])

@@ -1,0 +1,83 @@
+"""The models of a workspace, read without harm from what may have happened to them since."""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from corrsfm.colmap.models import read_models
+from corrsfm.errors import WorkspaceError
+from corrsfm.workspace.folder import Workspace
+
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["models_of"]
+
+logger = logging.getLogger("corrsfm")
+
+TRIAL_SECONDS = 20.0
+SECONDS_PER_MB = 0.2
+# Everything that is looked up later, so that an index that leads nowhere shows here; and files that end too
+# early, of which pycolmap makes up the rest, are longer when they are written again.
+_TRIAL = """
+import sys, tempfile, pathlib, numpy, pycolmap
+folder = pathlib.Path(sys.argv[1])
+model = pycolmap.Reconstruction(folder)
+for camera in model.cameras.values():
+    assert numpy.isfinite(camera.params).all() and camera.width > 0 and camera.height > 0
+with tempfile.TemporaryDirectory() as copy:
+    model.write_binary(copy)
+    for path in folder.glob("*.bin"):
+        assert path.stat().st_size == (pathlib.Path(copy) / path.name).stat().st_size, path
+for image in model.images.values():
+    image.camera.params, image.has_pose and image.cam_from_world()
+    assert all(model.exists_point3D(p.point3D_id) for p in image.points2D if p.has_point3D())
+for point in model.points3D.values():
+    for element in point.track.elements:
+        model.images[element.image_id].points2D[element.point2D_idx]
+"""
+
+
+def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> list[pycolmap.Reconstruction]:
+    """The reconstructed models, the largest first.
+
+    Models that are not as they were written, by an edit or by damage, are read in a process of their own
+    first: pycolmap does not come to an end with some damaged bytes, and ends the process with others.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    changed : iterable of Path, optional
+        What `Workspace.changed_files` found, if the caller has asked already.
+
+    Raises
+    ------
+    WorkspaceError
+        If there is none, or one cannot be read.
+    """
+    places = {
+        workspace.sparse / path.relative_to(workspace.sparse).parts[0]
+        for path in (workspace.changed_files("models") if changed is None else changed)
+        if path.is_relative_to(workspace.sparse)
+    }
+    for folder in sorted(places):
+        if not _can_be_read(folder):
+            remedy = f"{workspace.command_for('models')} --overwrite"
+            raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")
+        logger.warning("%s: changed since corrsfm wrote it; it is used as it is", folder)
+    return read_models(workspace.sparse)
+
+
+def _can_be_read(folder: Path) -> bool:
+    size = sum(path.stat().st_size for path in folder.glob("*") if path.is_file())
+    limit = TRIAL_SECONDS + SECONDS_PER_MB * size / 1e6
+    command = [sys.executable, "-c", _TRIAL, str(folder)]
+    try:
+        return subprocess.run(command, capture_output=True, timeout=limit, check=False).returncode == 0
+    except subprocess.TimeoutExpired:
+        return False

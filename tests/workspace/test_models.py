@@ -1,0 +1,48 @@
+"""Models that were changed since they were written are used if they can be read, and never hang or crash."""
+
+from pathlib import Path
+
+import pytest
+from finished_scene import make_finished_scene
+
+from corrsfm.errors import WorkspaceError
+from corrsfm.workspace import StageRecord, Workspace
+from corrsfm.workspace.models import models_of
+
+
+@pytest.fixture
+def workspace(tmp_path: Path) -> Workspace:
+    workspace = Workspace(make_finished_scene(tmp_path / "made", camera="SIMPLE_RADIAL").workspace)
+    workspace.finish("models", StageRecord(fingerprint="made up"))
+    return workspace
+
+
+def test_a_model_that_another_program_adjusted_is_used_with_a_warning(
+    workspace: Workspace, caplog: pytest.LogCaptureFixture
+) -> None:
+    (model,) = models_of(workspace)
+    assert not caplog.records
+    for point in model.points3D.values():
+        point.xyz = point.xyz + 0.01
+    model.write_binary(workspace.sparse / "0")
+    (again,) = models_of(workspace)
+    assert "changed since corrsfm wrote it" in caplog.text
+    assert again.num_points3D() == model.num_points3D()
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"])
+@pytest.mark.parametrize("way", ["cut", "noise", "count"])
+def test_a_damaged_model_is_named_with_the_command_that_makes_it_again(
+    workspace: Workspace, name: str, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("corrsfm.workspace.models.TRIAL_SECONDS", 4.0)
+    path = workspace.sparse / "0" / name
+    content = path.read_bytes()
+    changed = {
+        "cut": content[: len(content) // 2],
+        "noise": bytes((97 * place + 13) % 256 for place in range(len(content))),
+        "count": (2**40).to_bytes(8, "little") + content[8:],
+    }
+    path.write_bytes(changed[way])
+    with pytest.raises(WorkspaceError, match=r"sparse/0: damaged, .*: corrsfm reconstruct .* --overwrite"):
+        models_of(workspace)
