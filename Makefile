@@ -19,7 +19,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "== making the environment $(VENV) (downloads torch, a few hundred MB, once)"
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[report,evaluate,train,heif,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[report,evaluate,train,heif,cluster,dev]'
 	@touch $@
 
 demo: $(STAMP)

@@ -44,5 +44,5 @@ def unit_rows(descriptors: NDArray) -> NDArray[np.float32]:
 
 
 def half_precision(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Descriptors (N, D) rounded to what ``features.h5`` holds of them."""
+    """Descriptors (N, D) rounded to what a workspace holds of them."""
     return descriptors.astype(np.float16).astype(np.float32)

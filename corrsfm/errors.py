@@ -13,17 +13,21 @@ its text and exits non-zero. A text names the file or the pair, what was expecte
     ├── CheckpointError        a network checkpoint is damaged or of another network
     ├── DatabaseError          the COLMAP database cannot be read or written
     ├── ReconstructionError    mapping produced no model
+    ├── ClusterError           a Dask cluster cannot be used, or was lost
     └── DependencyError        an optional package is needed and absent
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 __all__ = [
     "CheckpointError",
+    "ClusterError",
     "ConfigError",
     "CorrsfmError",
+    "DamageError",
     "DatabaseError",
     "DependencyError",
     "ImageError",
@@ -31,9 +35,14 @@ __all__ = [
     "ReconstructionError",
     "WorkspaceError",
     "first_few",
+    "printable",
 ]
 
 _MAX_NAMED = 5
+_MOST_SHOWN_FIRST, _MOST_SHOWN_LAST = 1800, 600
+
+# Anything that may change what a terminal shows, but for the line breaks of our own texts.
+_UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 class CorrsfmError(Exception):
@@ -60,12 +69,20 @@ class CheckpointError(CorrsfmError):
     """A network checkpoint is damaged, of an unknown format or of another network."""
 
 
+class DamageError(WorkspaceError):
+    """A file of a workspace does not hold what was written to it."""
+
+
 class DatabaseError(CorrsfmError):
     """A COLMAP database cannot be read or written."""
 
 
 class ReconstructionError(CorrsfmError):
     """Mapping ended without a model."""
+
+
+class ClusterError(CorrsfmError):
+    """A Dask cluster cannot be used, or was lost."""
 
 
 class DependencyError(CorrsfmError):
@@ -93,3 +110,13 @@ def first_few(names: Iterable[str]) -> str:
     names = list(names)
     rest = len(names) - _MAX_NAMED
     return ", ".join(names[:_MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def printable(text: str) -> str:
+    """A text for a terminal, without what would steer it or flood it."""
+    text = _UNPRINTABLE.sub(lambda found: ascii(found[0])[1:-1], text)
+    # The cause is at the beginning, the advice at the end.
+    left_out = len(text) - _MOST_SHOWN_FIRST - _MOST_SHOWN_LAST
+    if left_out <= 0:
+        return text
+    return f"{text[:_MOST_SHOWN_FIRST]} … {left_out} more characters … {text[-_MOST_SHOWN_LAST:]}"

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
+import io
 import json
 import os
 import shutil
+import stat
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,9 +23,17 @@ __all__ = [
     "atomic_path",
     "atomic_write_json",
     "atomic_write_text",
+    "make_folder",
+    "open_file",
+    "read_bytes",
+    "read_json",
     "read_lines",
+    "read_text",
+    "require_file",
     "sha256_of",
     "share_file",
+    "sync_folder",
+    "why_unusable",
 ]
 
 OWN_RECORD = ".corrsfm.json"
@@ -30,26 +42,74 @@ OWN_RECORD = ".corrsfm.json"
 FRAME_TIMES = "frames.json"
 """The file beside the frames of a video that lists them in the order of time."""
 
+LARGEST_TEXT_BYTES = 1 << 28
+"""Of a list that is read at once: two million pairs of long names."""
+
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a sibling path to write to; rename it to ``path`` on success, remove it on failure.
 
-    Works for files and folders. A leftover of a killed process is removed first.
+    Works for files and folders. A leftover of a killed process is removed first. When this returns, the file
+    or everything in the folder is on the disk, and so is its name: a power cut leaves the old or the new.
+
+    Raises
+    ------
+    WorkspaceError
+        If nothing can be written there, or a folder is where a file should go.
     """
-    temporary = path.with_name(f".{path.name}.partial")
-    _remove(temporary)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = _unfinished(path)
     try:
         yield temporary
-        if temporary.is_dir():
-            _replace_folder(temporary, path)
-        else:
-            with open(temporary, "rb") as written:
-                os.fsync(written.fileno())
-            os.replace(temporary, path)
+        try:
+            if temporary.is_dir():
+                _replace_folder(temporary, path)
+            else:
+                _sync(temporary)
+                os.replace(temporary, path)
+                sync_folder(path.parent)
+        except (IsADirectoryError, NotADirectoryError) as error:
+            raise WorkspaceError(
+                f"{path}: cannot be replaced ({error.strerror}); choose another name"
+            ) from error
     finally:
         _remove(temporary)
+
+
+def _unfinished(path: Path) -> Path:
+    """Where a file or folder is written before it gets its name; nothing is there."""
+    if path.name in ("", ".."):
+        raise WorkspaceError(f"{path}: is a folder; expected the name of what to write in it")
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        make_folder(path.parent)
+        _remove(temporary)
+    except OSError as error:
+        raise WorkspaceError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+    return temporary
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those above it where they are missing, so that a power cut does not undo it."""
+    if folder.is_dir():
+        return
+    make_folder(folder.parent)
+    folder.mkdir(exist_ok=True)
+    sync_folder(folder.parent)
+
+
+def _sync(path: Path) -> None:
+    with open(path, "rb") as written:
+        os.fsync(written.fileno())
+
+
+def _sync_below(folder: Path) -> None:
+    """Flush every file of a folder, and which files it holds, to the disk."""
+    for root, _, names in os.walk(folder):
+        for name in names:
+            if not os.path.islink(path := os.path.join(root, name)):
+                _sync(Path(path))
+        sync_folder(Path(root))
 
 
 def _remove(path: Path) -> None:
@@ -63,9 +123,11 @@ def _replace_folder(source: Path, target: Path) -> None:
     """Put a folder in another's place; a kill in between leaves neither, never a mixture."""
     old = target.with_name(f".{target.name}.old")
     _remove(old)
+    _sync_below(source)
     if target.exists():
         os.replace(target, old)
     os.replace(source, target)
+    sync_folder(target.parent)
     _remove(old)
 
 
@@ -77,16 +139,25 @@ def atomic_write_text(path: Path, text: str) -> None:
     WorkspaceError
         If it cannot be written.
     """
+    with _writing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[Path]:
     try:
         with atomic_path(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+            yield temporary
     except OSError as error:
         raise WorkspaceError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def atomic_write_json(path: Path, value: Any) -> None:
     """Write JSON whole or not at all."""
-    atomic_write_text(path, json.dumps(value, indent=2, ensure_ascii=False, default=str) + "\n")
+    with _writing(path) as temporary, open(temporary, "w", encoding="utf-8") as stream:
+        # Piece by piece: the report of a large scene is larger than all it is made from.
+        json.dump(value, stream, indent=2, ensure_ascii=False, default=str)
+        stream.write("\n")
 
 
 def share_file(source: Path, name: Path) -> None:
@@ -110,6 +181,112 @@ def share_file(source: Path, name: Path) -> None:
             shutil.copy2(source, temporary)
 
 
+def sync_folder(folder: Path) -> None:
+    """Flush which files a folder holds to the disk, as far as its file system can."""
+    with contextlib.suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+def _open_regular(path: Path) -> io.BufferedReader:
+    """Open a file, but no pipe and no device: from these a program may read for ever; else `OSError`."""
+    # A pipe that nobody writes to would hold the opening up.
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    mode = os.fstat(handle).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(handle, "rb")
+    os.close(handle)
+    kind = "folder" if stat.S_ISDIR(mode) else "pipe or device"
+    raise OSError(errno.EINVAL, f"is a {kind}, expected a file", str(path))
+
+
+def open_file(path: Path) -> io.BufferedReader:
+    """Open a file that the user named for reading, but no pipe and no device.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it cannot be read, or it is none.
+    """
+    try:
+        return _open_regular(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def require_file(path: Path) -> None:
+    """Raise what `open_file` raises, for files that a library will open."""
+    open_file(path).close()
+
+
+def read_text(path: Path, *, largest_bytes: int = LARGEST_TEXT_BYTES) -> str:
+    """Text of a file that a person or another program wrote.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, is larger than that, or is not UTF-8 (with or without byte order mark).
+    """
+    with open_file(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > largest_bytes:
+            raise InputError(
+                f"{path}: has {size / 1e6:,.0f} MB, expected a text of at most {largest_bytes / 1e6:,.0f} MB"
+            )
+        try:
+            return file.read().decode("utf-8-sig")
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """What a file of our own holds; `OSError` if it cannot be read, or is a pipe or device."""
+    with _open_regular(path) as file:
+        return file.read()
+
+
+def read_json(path: Path) -> Any:
+    """What a JSON file of our own holds.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is a pipe or device.
+    ValueError
+        If it is not JSON.
+    """
+    try:
+        return json.loads(read_bytes(path).decode("utf-8"))
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+
+
+def why_unusable(path: str) -> str:
+    """What is wrong with a path whatever is there; empty if nothing."""
+    if not path:
+        return "expected a path, this one is empty"
+    try:
+        path.encode("utf-8")
+    except UnicodeEncodeError:
+        return "is not valid UTF-8; rename it"
+    if any(unicodedata.category(character) == "Cc" for character in path):
+        return "holds a line break or another control character; rename it"
+    try:
+        os.stat(path)
+    except OSError as error:
+        # A place that is not there yet, or a pattern.
+        if error.errno not in (errno.ENOENT, errno.ENOTDIR):
+            return f"cannot be used: {str(error.strerror).lower()}"
+    return ""
+
+
 def sha256_of(path: Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes.
 
@@ -118,11 +295,11 @@ def sha256_of(path: Path) -> str:
     InputError
         If the file cannot be read.
     """
-    try:
-        with path.open("rb") as stream:
+    with open_file(path) as stream:
+        try:
             return hashlib.file_digest(stream, "sha256").hexdigest()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
 def read_lines(path: Path) -> list[str]:
@@ -131,13 +308,6 @@ def read_lines(path: Path) -> list[str]:
     Raises
     ------
     InputError
-        If it cannot be read, or is not UTF-8 (with or without byte order mark).
+        As `read_text`.
     """
-    try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: is not UTF-8 text ({error}); save it as UTF-8") from error
+    return read_text(path).splitlines()

@@ -1,17 +1,19 @@
-"""Groups of photos that pairs connect."""
+"""Which photos pairs connect, and which pairs share photos."""
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Iterable, Sequence
 
 from corrsfm.errors import first_few
 from corrsfm.types import Pair
 
-__all__ = ["MAX_NAMED_GROUPS", "connected_components", "describe_components"]
+__all__ = ["MAX_NAMED_GROUPS", "connected_components", "describe_components", "neighbours_together"]
 
 
 MAX_NAMED_GROUPS = 5
+
+_TILE = 16
 
 
 def connected_components(names: Sequence[str], pairs: Iterable[Pair]) -> list[list[str]]:
@@ -45,3 +47,31 @@ def describe_components(names: Sequence[str], pairs: Iterable[Pair]) -> str:
     for group in components[1 : 1 + MAX_NAMED_GROUPS]:
         lines.append(f"not connected to the largest group: {first_few(group)}")
     return "\n".join(lines)
+
+
+def neighbours_together(pairs: Iterable[Pair]) -> list[Pair]:
+    """Order pairs so that those that follow each other share photos, whatever the photos are called.
+
+    Photos are numbered by breadth-first search, from neighbour to neighbour. The pairs are taken from the
+    matrix of these numbers in tiles, which hold many pairs of few photos.
+    """
+    pairs = list(pairs)
+    neighbours = defaultdict(list)
+    for name0, name1 in pairs:
+        neighbours[name0].append(name1)
+        neighbours[name1].append(name0)
+    number: dict[str, int] = {}
+    for start in sorted(neighbours):
+        waiting = deque([start] if start not in number else [])
+        number.setdefault(start, len(number))
+        while waiting:
+            for name in sorted(neighbours[waiting.popleft()]):
+                if name not in number:
+                    number[name] = len(number)
+                    waiting.append(name)
+
+    def place(pair: Pair) -> tuple[int, ...]:
+        low, high = sorted((number[pair[0]], number[pair[1]]))
+        return low // _TILE, high // _TILE, low, high
+
+    return sorted(pairs, key=place)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import importlib.metadata
 import itertools
 import os
 import platform
+import select
+import signal
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -14,9 +18,11 @@ from typing import Any, TypeVar
 from corrsfm import __version__
 from corrsfm.errors import ConfigError
 
-__all__ = ["count_threads", "find_device", "threaded", "use_threads", "versions"]
+__all__ = ["count_threads", "end_with_parent", "find_device", "threaded", "use_threads", "versions"]
 
 RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
+
+_PR_SET_PDEATHSIG = 1
 
 K = TypeVar("K")
 R = TypeVar("R")
@@ -83,6 +89,26 @@ def threaded(work: Callable[[K], R], keys: Iterable[K], num_threads: int) -> Ite
         finally:
             for _, future in waiting:
                 future.cancel()
+
+
+def end_with_parent(sentinel: int) -> None:
+    """Kill this process once the one that started it is gone, whatever ended that one.
+
+    Parameters
+    ----------
+    sentinel : int
+        A file descriptor that nothing is written to and that closes with the parent: a pipe of which it holds
+        the other end.
+    """
+
+    def watch() -> None:
+        select.select([sentinel], [], [])
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+    # The thread waits for native code that holds the interpreter, Linux does not. Others have no prctl.
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
 
 
 def versions(packages: Iterable[str] = RECORDED_PACKAGES) -> dict[str, str]:

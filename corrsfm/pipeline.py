@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm import config as cfg
+from corrsfm.cluster import connected
 from corrsfm.database.stage import verify_matches
 from corrsfm.errors import ReconstructionError
 from corrsfm.features import create_extractor
@@ -33,7 +34,7 @@ from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
-from corrsfm.workspace.imported import refuse_foreign_files, traits_to_come
+from corrsfm.workspace.imported import traits_to_come
 from corrsfm.workspace.lists import read_index
 from corrsfm.workspace.resume import StageOutcome
 from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, keep_warnings
@@ -61,6 +62,7 @@ def run_scene(
     config: cfg.PipelineConfig,
     *,
     overwrite: bool = False,
+    wait: bool = False,
     warned: Sequence[str] = (),
 ) -> SceneReport:
     """Go from photos or a video to models and a report, skipping what is finished.
@@ -73,6 +75,8 @@ def run_scene(
     config : PipelineConfig
     overwrite : bool
         Redo finished work.
+    wait : bool
+        Wait for another process that works in the workspace instead of failing.
     warned : sequence of str
         What the caller warned of already, such as options without effect; for the report.
 
@@ -93,8 +97,9 @@ def run_scene(
                 run, config.prune, features=config.features, matches=config.matches,
                 workspace_dir=workspace_dir,
             )  # fmt: skip
+            stack.enter_context(connected(run.cluster, run.workers))
             workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
-            stack.enter_context(workspace.lock())
+            stack.enter_context(workspace.lock(wait=wait))
         keep_warnings(workspace.warnings_json, BEFORE_STAGES, [*warned, *met])
         _say(index_photos(workspace, photos, config.images, run, overwrite=overwrite))
         _say(extract_features(workspace, config.features, run, overwrite=overwrite))
@@ -169,7 +174,6 @@ def check_options(
     features, matches = features or cfg.FeaturesConfig(), matches or cfg.MatchesConfig()
     known = None
     if workspace_dir is not None:
-        refuse_foreign_files(workspace_dir)
         known = Workspace(workspace_dir) if (workspace_dir / "workspace.json").exists() else None
     traits = traits_to_come(known, features, matches)
     if features.extractor.kind != cfg.FeatureKind.SIFT:

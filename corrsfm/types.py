@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.camera import Camera
+from corrsfm.errors import InputError
 
 __all__ = [
     "Camera",
@@ -38,19 +39,46 @@ __all__ = [
     "PruneResult",
     "TwoViewModel",
     "VerifiedPair",
+    "check_array",
+    "check_indices",
 ]
 
 Pair = tuple[str, str]
 """Two image names; the order is the orientation of everything stored for the pair."""
 
 
-def _check(name: str, array: NDArray, shape: tuple[int | None, ...], dtype: type) -> None:
+def check_array(name: str, array: NDArray, shape: tuple[int | None, ...], dtype: type) -> None:
+    """Raise `ValueError` unless an array has this shape, of which None fits anything, and this dtype."""
     if array.dtype != np.dtype(dtype):
         raise ValueError(f"{name}: expected dtype {np.dtype(dtype)}, got {array.dtype}")
     if array.ndim != len(shape) or any(
         s is not None and s != a for s, a in zip(shape, array.shape, strict=True)
     ):
         raise ValueError(f"{name}: expected shape {shape}, got {array.shape}")
+
+
+def check_indices(pair: Pair, indices: NDArray[np.int32], num_keypoints: tuple[int, int]) -> None:
+    """Refuse matches of keypoints that the photos do not have.
+
+    Parameters
+    ----------
+    pair : Pair
+    indices : (N, 2) int32
+    num_keypoints : tuple of int
+        Of the two photos.
+
+    Raises
+    ------
+    InputError
+        Naming the pair, the keypoint and the photo.
+    """
+    for name, column, num in zip(pair, indices.T, num_keypoints, strict=True):
+        if len(column) and (column.min() < 0 or column.max() >= num):
+            wrong = int(column.min() if column.min() < 0 else column.max())
+            raise InputError(
+                f"pair {' – '.join(pair)}: a match uses keypoint {wrong} of {name}, which has {num}; the "
+                "matches belong to other features, match and prune again with --overwrite"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,14 +138,14 @@ class Features:
 
     def __post_init__(self) -> None:
         num = len(self.keypoints)
-        _check("keypoints", self.keypoints, (num, 2), np.float32)
+        check_array("keypoints", self.keypoints, (num, 2), np.float32)
         if self.scales is not None:
-            _check("scales", self.scales, (num,), np.float32)
+            check_array("scales", self.scales, (num,), np.float32)
         if self.orientations is not None:
-            _check("orientations", self.orientations, (num,), np.float32)
-        _check("scores", self.scores, (num,), np.float32)
+            check_array("orientations", self.orientations, (num,), np.float32)
+        check_array("scores", self.scores, (num,), np.float32)
         floats = self.descriptors.dtype == np.float32
-        _check("descriptors", self.descriptors, (num, None), np.float32 if floats else np.uint8)
+        check_array("descriptors", self.descriptors, (num, None), np.float32 if floats else np.uint8)
 
     def __len__(self) -> int:
         return len(self.keypoints)
@@ -152,11 +180,11 @@ class Matches:
 
     def __post_init__(self) -> None:
         num = len(self.indices)
-        _check("indices", self.indices, (num, 2), np.int32)
-        _check("ratios", self.ratios, (num,), np.float32)
-        _check("mutual", self.mutual, (num,), np.bool_)
+        check_array("indices", self.indices, (num, 2), np.int32)
+        check_array("ratios", self.ratios, (num,), np.float32)
+        check_array("mutual", self.mutual, (num,), np.bool_)
         if self.scores is not None:
-            _check("scores", self.scores, (num,), np.float32)
+            check_array("scores", self.scores, (num,), np.float32)
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -231,15 +259,15 @@ class Correspondences:
 
     def __post_init__(self) -> None:
         num = len(self.points0)
-        _check("points0", self.points0, (num, 2), np.float32)
-        _check("points1", self.points1, (num, 2), np.float32)
-        _check("normalised", self.normalised, (num, 4), np.float32)
-        _check("ratios", self.ratios, (num,), np.float32)
-        _check("mutual", self.mutual, (num,), np.bool_)
-        _check("log_scale_ratios", self.log_scale_ratios, (num,), np.float32)
-        _check("rotations", self.rotations, (num,), np.float32)
+        check_array("points0", self.points0, (num, 2), np.float32)
+        check_array("points1", self.points1, (num, 2), np.float32)
+        check_array("normalised", self.normalised, (num, 4), np.float32)
+        check_array("ratios", self.ratios, (num,), np.float32)
+        check_array("mutual", self.mutual, (num,), np.bool_)
+        check_array("log_scale_ratios", self.log_scale_ratios, (num,), np.float32)
+        check_array("rotations", self.rotations, (num,), np.float32)
         if self.scores is not None:
-            _check("scores", self.scores, (num,), np.float32)
+            check_array("scores", self.scores, (num,), np.float32)
 
     def __len__(self) -> int:
         return len(self.points0)
@@ -261,7 +289,7 @@ class TwoViewModel:
     matrix: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        _check("matrix", self.matrix, (3, 3), np.float64)
+        check_array("matrix", self.matrix, (3, 3), np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,17 +318,17 @@ class PruneResult:
 
     def __post_init__(self) -> None:
         num = len(self.scores)
-        _check("scores", self.scores, (num,), np.float32)
-        _check("inlier_mask", self.inlier_mask, (num,), np.bool_)
+        check_array("scores", self.scores, (num,), np.float32)
+        check_array("inlier_mask", self.inlier_mask, (num,), np.bool_)
         if len(self.residuals) == 0:
             object.__setattr__(self, "residuals", np.full(num, np.nan, np.float32))
-        _check("residuals", self.residuals, (num,), np.float32)
+        check_array("residuals", self.residuals, (num,), np.float32)
 
     def __len__(self) -> int:
         return len(self.scores)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class VerifiedPair:
     """What a database says about a pair.
 
@@ -320,7 +348,7 @@ class VerifiedPair:
     num_inliers: int
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, slots=True)
 class PairStatistics:
     """How many matches of a pair survived each step.
 

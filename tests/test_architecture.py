@@ -19,7 +19,18 @@ STAGES = ("images", "features", "pairs", "matches", "prune", "database", "recons
 FLOORS: list[tuple[str, set[str]]] = [
     (
         "what everything may use",
-        {"corrsfm", "errors", "camera", "types", "geometry", "descriptors", "graph", "files", "machine"},
+        {
+            "corrsfm",
+            "errors",
+            "camera",
+            "types",
+            "geometry",
+            "descriptors",
+            "graph",
+            "files",
+            "machine",
+            "cluster",
+        },
     ),
     ("the options", {"config"}),
     ("what lies on disk, COLMAP's data and the network", {"workspace", "colmap", "model"}),
@@ -37,7 +48,9 @@ FLOOR = {room: number for number, (_, rooms) in enumerate(FLOORS) for room in ro
 ON_ONE_FLOOR: dict[tuple[str, str], str] = {
     ("camera", "errors"): "a camera that is not possible says so",
     ("types", "camera"): "the record stands beside the others",
+    ("types", "errors"): "matches of other features are refused in one place",
     ("files", "errors"): "a file that cannot be read says so",
+    ("cluster", "errors"): "a cluster that cannot be used says so",
     ("machine", "errors"): "a device that cannot be used says so",
     ("graph", "errors"): "long lists of names are cut in one place",
     ("graph", "types"): "a pair is two names",

@@ -1,6 +1,9 @@
 """What this process runs on."""
 
 import os
+import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -53,3 +56,12 @@ def test_threaded_work_comes_back_in_order_and_is_not_far_ahead() -> None:
 def test_versions_name_what_is_installed_and_nothing_else() -> None:
     found = versions(["numpy", "no-such-package-here"])
     assert list(found) == ["corrsfm", "python", "numpy"]
+
+
+def test_a_process_ends_with_the_one_that_holds_its_pipe() -> None:
+    code = "import time; from corrsfm.machine import end_with_parent; end_with_parent(0); time.sleep(60)"
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    with pytest.raises(subprocess.TimeoutExpired):
+        process.wait(1)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL

@@ -7,6 +7,7 @@ import os
 import random
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -33,9 +34,9 @@ from corrsfm.pipeline import run_scene
 from corrsfm.reconstruction import stage as mapping
 from corrsfm.types import Correspondences, PruneResult
 from corrsfm.workspace import StageRecord, Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
 from corrsfm.workspace.lists import read_index, read_pairs
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 SMALL = cfg.FeaturesConfig(max_features=60)
@@ -68,14 +69,14 @@ def verify(workspace: Workspace, photos: Path) -> None:
 def contents(workspace: Workspace) -> dict[str, object]:
     """Everything a workspace holds up to pruning, as comparable values."""
     values: dict[str, object] = {}
-    with ItemStore(workspace.features, FEATURES).reader() as read:
+    with features_of(workspace).reader() as read:
         for name in read_index(workspace).names:
             item = read(name)
             values[name] = (item.keypoints.tobytes(), item.descriptors.tobytes())
-    with ItemStore(workspace.matches, MATCHES).reader() as read_matches:
+    with matches_of(workspace).reader() as read_matches:
         for pair in read_pairs(workspace).pairs:
             values[f"m {pair}"] = read_matches(pair).indices.tobytes()
-    with ItemStore(workspace.pruned, PRUNED).reader() as read_pruned:
+    with pruned_of(workspace).reader() as read_pruned:
         for pair in read_pairs(workspace).pairs:
             values[f"p {pair}"] = read_pruned(pair).indices.tobytes()
     return values
@@ -94,11 +95,11 @@ def workspace(tmp_path: Path) -> Workspace:
 
 def test_a_second_run_keeps_everything(workspace: Workspace, photos: Path) -> None:
     assert run_front(workspace, photos)["matches"] == (6, 0)
-    before = {path.name: path.stat().st_mtime_ns for path in workspace.root.glob("*.h5")}
+    before = {path.name: path.stat().st_mtime_ns for path in workspace.root.rglob("*.db")}
     assert len(before) == 3
     again = run_front(workspace, photos)
     assert all(items == kept for stage, (items, kept) in again.items() if stage != "images")
-    assert before == {path.name: path.stat().st_mtime_ns for path in workspace.root.glob("*.h5")}
+    assert before == {path.name: path.stat().st_mtime_ns for path in workspace.root.rglob("*.db")}
 
 
 def test_unchanged_photos_are_not_even_opened_again(
@@ -176,12 +177,18 @@ def test_a_method_that_was_used_before_prunes_nothing_again(workspace: Workspace
     assert after == contents(fresh)
 
 
-def test_kept_matches_of_a_workspace_from_before_are_found(workspace: Workspace, photos: Path) -> None:
+def test_damaged_items_are_made_again_alone(workspace: Workspace, photos: Path) -> None:
     run_front(workspace, photos)
-    shutil.rmtree(workspace.pruned_by("ratio").parent)
-    none = cfg.PruneConfig(method=cfg.PruneMethod.NONE)
-    assert run_front(workspace, photos)["pruned matches"] == (6, 6)
-    assert run_front(workspace, photos, prune=none)["pruned matches"] == (6, 0)
+    before = contents(workspace)
+    with contextlib.closing(sqlite3.connect(workspace.matches)) as store, store:
+        store.execute("UPDATE arrays SET data = zeroblob(length(data)) WHERE number = 2")
+    verify = dataclasses.replace(RUN, verify=True)
+    assert pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN).skipped
+    outcome = pipeline.match_pairs(workspace, cfg.MatchesConfig(), verify)
+    assert (outcome.num_items, outcome.num_reused) == (6, 5)
+    again = run_front(workspace, photos)
+    assert all(items == kept for stage, (items, kept) in again.items() if stage != "images")
+    assert contents(workspace) == before
 
 
 def test_an_option_of_speed_redoes_nothing(workspace: Workspace, photos: Path) -> None:
@@ -215,11 +222,17 @@ def test_a_deleted_file_is_made_again(workspace: Workspace, photos: Path) -> Non
     assert contents(workspace) == before
 
 
-def test_a_half_written_feature_file_is_refused_not_used(workspace: Workspace, photos: Path) -> None:
+@pytest.mark.parametrize("length", [0, 1000, 10_000])
+def test_a_truncated_feature_file_is_put_aside_and_made_again(
+    workspace: Workspace, photos: Path, length: int, caplog: pytest.LogCaptureFixture
+) -> None:
     run_front(workspace, photos)
-    workspace.features.write_bytes(workspace.features.read_bytes()[:1000])
-    with pytest.raises(WorkspaceError, match=r"features\.h5: not a readable HDF5 file"):
-        run_front(workspace, photos)
+    before = contents(workspace)
+    workspace.features.write_bytes(workspace.features.read_bytes()[:length])
+    run_front(workspace, photos)
+    assert "features.db: damaged" in caplog.text and "the old file as features.db.damaged" in caplog.text
+    workspace.features.with_name("features.db.damaged").unlink()
+    assert contents(workspace) == before
 
 
 def test_an_unreadable_photo_is_named_and_the_others_are_kept(workspace: Workspace, photos: Path) -> None:
@@ -264,7 +277,7 @@ class RandomHistory(RuleBasedStateMachine):
     def change_pruning(self, ratio: float) -> None:
         self.prune = cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=ratio)
 
-    @rule(name=st.sampled_from(["features.h5", "matches.h5", "pruned.h5", "pairs.txt", "images.json"]))
+    @rule(name=st.sampled_from(["features.db", "matches.db", "pruned/ratio.db", "pairs.txt", "images.json"]))
     def lose_a_file(self, name: str) -> None:
         (self.workspace.root / name).unlink(missing_ok=True)
 
@@ -365,7 +378,7 @@ def test_same_input_gives_same_bytes(tmp_path: Path, photos: Path) -> None:
 
 def test_a_broken_link_is_an_unreadable_photo(workspace: Workspace, photos: Path) -> None:
     (photos / "4.png").symlink_to("nowhere.png")
-    with pytest.raises(ImageError, match=r"4\.png: cannot be read"):
+    with pytest.raises(ImageError, match=r"4\.png: no such file"):
         pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
     outcome = pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
     assert outcome.num_items == 4
@@ -420,10 +433,10 @@ def test_a_left_out_photo_is_tried_again(
         pipeline.index_photos(workspace, photos, strict, RUN)
         with pytest.raises(ImageError, match=r"2\.png: Input/output error"):
             pipeline.extract_features(workspace, SMALL, RUN)
-    assert len(ItemStore(workspace.features, FEATURES).read("2.png")) == 0
+    assert len(features_of(workspace).read("2.png")) == 0
     outcome = pipeline.extract_features(workspace, SMALL, RUN)
     assert (outcome.num_items, outcome.num_reused) == (4, 3)
-    assert len(ItemStore(workspace.features, FEATURES).read("2.png")) > 10
+    assert len(features_of(workspace).read("2.png")) > 10
 
 
 def test_a_folder_without_most_photos_costs_no_finished_work(
@@ -512,7 +525,7 @@ def test_matches_that_do_not_belong_to_the_features_are_not_pruned(
     workspace.matches.write_bytes(matches)
     assert record.fingerprint != now.fingerprint
     config = cfg.PruneConfig(method=cfg.PruneMethod.RATIO, max_ratio=0.3)
-    with pytest.raises(WorkspaceError, match=r"matches\.h5: older than the features; run: corrsfm match"):
+    with pytest.raises(WorkspaceError, match=r"matches\.db: is not the file that .*; run: corrsfm match"):
         pipeline.prune_matches(workspace, config, RUN)
 
 
@@ -578,7 +591,7 @@ def test_a_truncated_database_is_written_again(
         with pytest.raises(WorkspaceError, match=r"damaged, its end is missing; run: corrsfm prune .* ratio"):
             stage()
     assert not pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
-    assert "database.db: damaged, its end is missing; it is written again" in caplog.text
+    assert "database.db: damaged (its end is missing); it is written again" in caplog.text
     assert len(workspace.database.read_bytes()) == len(whole)
     assert pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
 

@@ -33,6 +33,10 @@ from corrsfm.evaluation.records import load_results
 from corrsfm.evaluation.tables import Table, build_table
 from corrsfm.files import atomic_write_text
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from tools.house_tables import HOUSE_TABLES, draw_growth  # noqa: E402
+
 __all__ = ["DOCUMENTS", "RESULTS_DIR", "choose", "main", "render_document", "update_document"]
 
 _REPOSITORY = Path(__file__).resolve().parents[1]
@@ -159,7 +163,8 @@ def render_document(text: str, results_dir: Path, *, where: str = "document") ->
         else:
             marker = f"{where}, table:{match['name']}"
             chosen = _parse_choice(match["choice"], marker)
-            table = choose(build_table(values), chosen.get("rows", {}), chosen.get("columns", {}), marker)
+            build = HOUSE_TABLES.get(values["kind"], build_table)
+            table = choose(build(values), chosen.get("rows", {}), chosen.get("columns", {}), marker)
             content = table.markdown()
         return f"{match['start']}{content}\n{match['end']}"
 
@@ -196,6 +201,19 @@ def update_document(path: Path, results_dir: Path, *, check: bool = False) -> bo
     return rendered != text
 
 
+def _update_picture(results_dir: Path, *, check: bool) -> list[str]:
+    """Draw growth.svg; its path if it differed from its results."""
+    path, source = results_dir / "growth.svg", results_dir / "growth.json"
+    if not source.exists():
+        return []
+    drawn = draw_growth(load_results(source, "growth"))
+    if path.exists() and path.read_text(encoding="utf-8") == drawn:
+        return []
+    if not check:
+        atomic_write_text(path, drawn)
+    return [str(path)]
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description="Write the tables of documents from result files.")
@@ -209,6 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for path in options.documents
             if update_document(path, options.results_dir, check=options.check)
         ]
+        changed += _update_picture(options.results_dir, check=options.check)
     except CorrsfmError as error:
         sys.exit(f"error: {error}")
     if changed and options.check:

@@ -13,6 +13,7 @@ import argparse
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -209,7 +210,7 @@ def main() -> None:
                 row["runs"].append(measure(model, scene, seed))
                 if row not in rows:
                     rows.append(row)
-                command = " ".join(["python tools/whole_scenes.py", *sys.argv[1:]])
+                command = shlex.join(["python", "tools/whole_scenes.py", *sys.argv[1:]])
                 values = {"provenance": provenance(seed=0, command=command), "rows": rows}
                 save_results(arguments.results, "whole_scenes", values)
                 print(scene.name, setting.name, row["runs"][-1], flush=True)

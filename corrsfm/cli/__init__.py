@@ -22,7 +22,7 @@ from corrsfm.cli.importing import import_
 from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.train import train
-from corrsfm.errors import CorrsfmError
+from corrsfm.errors import CorrsfmError, printable
 
 __all__ = ["main"]
 
@@ -34,7 +34,7 @@ class _Handler(logging.Handler):
         from tqdm import tqdm
 
         prefix = "" if record.levelno < logging.WARNING else f"{record.levelname.lower()}: "
-        tqdm.write(prefix + record.getMessage(), file=sys.stderr)
+        tqdm.write(prefix + printable(record.getMessage()), file=sys.stderr)
 
 
 class _Interruption(click.ClickException):
@@ -53,7 +53,7 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except CorrsfmError as error:
-            raise click.ClickException(str(error)) from error
+            raise click.ClickException(printable(str(error))) from error
         except KeyboardInterrupt as error:
             raise _Interruption(f"interrupted; {_how_to_go_on(ctx)}") from error
 
@@ -74,13 +74,18 @@ def _how_to_go_on(ctx: click.Context) -> str:
 )
 @click.version_option(__version__)
 @click.option("-q", "--quiet", is_flag=True, help="Say nothing but warnings and errors; no progress bars.")
-def main(quiet: bool) -> None:
+@click.option("--attended", is_flag=True, hidden=True, help="End when standard input closes.")
+def main(quiet: bool, attended: bool) -> None:
     """Structure from motion with learned correspondence pruning.
 
     `corrsfm run PHOTOS WORKSPACE` goes from a folder of photos to models and a report, in steps that are
     commands too; `corrsfm export WORKSPACE OUT --for TOOL` hands the result on. Finished work is kept: after
     an interruption or a changed option, run the same command again.
     """
+    if attended:
+        from corrsfm.machine import end_with_parent
+
+        end_with_parent(sys.stdin.fileno())
     logger = logging.getLogger("corrsfm")
     logger.handlers = [_Handler()]
     logger.setLevel(logging.WARNING if quiet else logging.INFO)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from corrsfm.cli.options import echo_json, json_option, run_options
+from corrsfm.cli.options import PATH, echo_json, json_option, run_options
 from corrsfm.config import Precision, RunConfig
 
 __all__ = ["bench"]
@@ -16,7 +16,7 @@ __all__ = ["bench"]
 @click.command()
 @click.option(
     "--model",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Checkpoint; the published architecture if not given.",
 )
 @click.option(
@@ -53,7 +53,7 @@ __all__ = ["bench"]
     "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timed repetitions."
 )
 @run_options
-@click.option("--results", type=click.Path(path_type=Path), help="Also write a result file here.")
+@click.option("--results", type=PATH, help="Also write a result file here.")
 @json_option
 def bench(
     model: Path | None,

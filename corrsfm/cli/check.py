@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shlex
 from collections import Counter
 from collections.abc import Sequence
@@ -11,14 +12,12 @@ from pathlib import Path
 import click
 
 from corrsfm.cli.finished import show_workspace
-from corrsfm.cli.options import echo_json, json_option
+from corrsfm.cli.options import PATH, echo_json, json_option
 from corrsfm.errors import CorrsfmError, first_few
 
 __all__ = ["check"]
 
 logger = logging.getLogger("corrsfm")
-
-PATH = click.Path(path_type=Path)
 
 
 @click.command()
@@ -42,7 +41,9 @@ PATH = click.Path(path_type=Path)
     show_default=True,
     help="Of a workspace, read every item of every file.",
 )
-@click.option("--threads", type=click.IntRange(0), default=0, help="Photos read at a time; 0 is all cores.")
+@click.option(
+    "--threads", type=click.IntRange(0, 1024), default=0, help="Photos read at a time; 0 is all cores."
+)
 @json_option
 def check(
     photos: tuple[Path, ...],
@@ -64,7 +65,7 @@ def check(
     promising first. Changes nothing. Ends with code 1 if there is damage or no model, or if the verdict on it
     is "wrong".
     """
-    if len(photos) == 1 and (photos[0] / "workspace.json").is_file():
+    if len(photos) == 1 and os.path.lexists(photos[0] / "workspace.json"):
         show_workspace(photos[0], as_json, integrity)
         return
     from corrsfm.config import PipelineConfig, RunConfig

@@ -10,6 +10,7 @@ from click.core import ParameterSource
 
 from corrsfm.cli.evaluate import command_line
 from corrsfm.cli.options import (
+    PATH,
     echo_json,
     json_option,
     overwrite_option,
@@ -20,8 +21,6 @@ from corrsfm.cli.sections import SectionedCommand
 from corrsfm.config import PipelineConfig
 
 __all__ = ["compare"]
-
-PATH = click.Path(path_type=Path)
 
 
 @click.command(

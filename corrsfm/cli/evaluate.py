@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from corrsfm.cli.options import echo_json, json_option, overwrite_option, run_options, seeds_option
+from corrsfm.cli.options import PATH, echo_json, json_option, overwrite_option, run_options, seeds_option
 from corrsfm.config import RunConfig
 
 __all__ = ["command_line", "evaluate"]
@@ -22,7 +22,6 @@ FILTERS = (
 ESTIMATORS = (
     "ransac, usac, accurate, magsac, prosac, degensac, colmap, poselib or w8pt, with :PIXELS if wanted"
 )
-PATH = click.Path(path_type=Path)
 results_option = click.option(
     "--results", type=PATH, help="Result file; what it holds already is not measured again."
 )

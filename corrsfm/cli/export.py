@@ -7,12 +7,11 @@ from pathlib import Path
 
 import click
 
-from corrsfm.cli.options import echo_json, json_option
+from corrsfm.cli.options import PATH, echo_json, json_option
 from corrsfm.export import ExportTarget
 
 __all__ = ["NEXT", "export"]
 
-PATH = click.Path(path_type=Path)
 
 _COLMAP = "colmap gui --database_path {}/database.db --image_path {}/images --import_path {}/sparse/0"
 # What to paste next; {} is the output.

@@ -7,12 +7,10 @@ from pathlib import Path
 import click
 
 from corrsfm import config as cfg
-from corrsfm.cli.options import echo_json, json_option, run_options
+from corrsfm.cli.options import PATH, echo_json, json_option, run_options
 from corrsfm.errors import first_few
 
 __all__ = ["add", "localize", "show_workspace"]
-
-PATH = click.Path(path_type=Path)
 
 
 @click.command()

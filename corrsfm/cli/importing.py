@@ -8,12 +8,10 @@ from pathlib import Path
 import click
 
 from corrsfm import config as cfg
-from corrsfm.cli.options import config_options, echo_json, json_option
+from corrsfm.cli.options import PATH, config_options, echo_json, json_option
 from corrsfm.cli.sections import SectionedCommand
 
 __all__ = ["import_"]
-
-PATH = click.Path(path_type=Path)
 
 
 @click.command("import", cls=SectionedCommand, most_used=("features", "matches", "database", "kind"))

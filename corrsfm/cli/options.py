@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import json
 import logging
+import os
 import typing
 from collections.abc import Callable, Collection, Sequence
 from enum import StrEnum
@@ -18,10 +19,13 @@ from click.core import ParameterSource
 from corrsfm import config as cfg
 from corrsfm.cli.sections import SectionedOption, section_of
 from corrsfm.config.fields import flag_of
+from corrsfm.errors import printable
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
+from corrsfm.files import why_unusable
 
 __all__ = [
     "OVERWRITE_KEY",
+    "PATH",
     "WARNED_KEY",
     "config_options",
     "echo_json",
@@ -29,6 +33,7 @@ __all__ = [
     "overwrite_option",
     "pipeline_options",
     "recipe_options",
+    "resuming_run_options",
     "run_options",
     "seeds_option",
     "usage_options",
@@ -39,7 +44,25 @@ OVERWRITE_KEY = "corrsfm.overwrite"
 # In the context, what was said of options before the command began.
 WARNED_KEY = "corrsfm.warned"
 
+_LONGEST_SHOWN = 80
+
 logger = logging.getLogger("corrsfm")
+
+
+class _PathType(click.Path):
+    """A path as `Path`; refuses those at which nothing can be looked up, or that no list can hold."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        text = os.fspath(value)
+        if why := why_unusable(text):
+            shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
+            self.fail(f"'{printable(shown)}' {why}" if text else why, param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = _PathType(path_type=Path)
+"""The type of every argument and option that is a path."""
+
 
 F = typing.TypeVar("F", bound=Callable[..., Any])
 
@@ -72,7 +95,7 @@ def _option(entry: dataclasses.Field, annotation: Any, section: str, *, hidden: 
             settings |= {"multiple": True, "default": [str(member) for member in defaults]}
     elif inner is Path:
         several = typing.get_origin(annotation) is tuple
-        settings |= {"type": click.Path(path_type=Path), "show_default": False, "multiple": several}
+        settings |= {"type": PATH, "show_default": False, "multiple": several}
     elif inner in (int, float):
         settings["type"] = inner
     else:
@@ -80,10 +103,11 @@ def _option(entry: dataclasses.Field, annotation: Any, section: str, *, hidden: 
     return click.option(flag, entry.name, **settings)
 
 
-def config_options(**configs: type) -> Callable[[F], F]:
+def config_options(*, hidden: Collection[str] = (), **configs: type) -> Callable[[F], F]:
     """Give a command a flag for every field of the named config dataclasses.
 
-    ``@config_options(features=FeaturesConfig)`` calls the command with ``features=FeaturesConfig(...)``.
+    ``@config_options(features=FeaturesConfig)`` calls the command with ``features=FeaturesConfig(...)``. The
+    help leaves out fields in ``hidden``.
 
     Raises
     ------
@@ -98,7 +122,7 @@ def config_options(**configs: type) -> Callable[[F], F]:
                 kwargs[keyword] = _override(cls(), kwargs)
             return command(*args, **kwargs)
 
-        return typing.cast(F, _with_flags(wrapped, configs.values()))
+        return typing.cast(F, _with_flags(wrapped, configs.values(), hidden))
 
     return decorate
 
@@ -113,7 +137,7 @@ def pipeline_options(command: F, *, several_methods: bool = False) -> F:
     file_option = click.option(
         "--pipeline",
         "file",
-        type=click.Path(path_type=Path),
+        type=PATH,
         help="Pipeline file in TOML; flags typed here override it.",
     )
     tables = [entry.name for entry in dataclasses.fields(cfg.PipelineConfig)]
@@ -134,7 +158,7 @@ def recipe_options(command: F) -> F:
     file_option = click.option(
         "--config",
         "file",
-        type=click.Path(path_type=Path),
+        type=PATH,
         help="Recipe in TOML (tables train, augment, synthetic, network); flags typed here override it.",
     )
     return file_option(_overriding(command, "recipe", TrainRecipe(), load_recipe, ["train"]))
@@ -212,6 +236,11 @@ def _warn_of_idle(config: Any, given: Collection[str]) -> None:
 
 def run_options(command: F) -> F:
     """``--seed``, ``--device`` and ``--threads``; the command is called with ``run=RunConfig(...)``."""
+    return config_options(hidden=("verify", "cluster", "workers"), run=cfg.RunConfig)(command)
+
+
+def resuming_run_options(command: F) -> F:
+    """`run_options`, ``--verify``, ``--cluster`` and ``--workers``, for commands that make and keep items."""
     return config_options(run=cfg.RunConfig)(command)
 
 

@@ -11,12 +11,14 @@ import click
 
 from corrsfm import config as cfg
 from corrsfm.cli.options import (
+    PATH,
     WARNED_KEY,
     config_options,
     echo_json,
     json_option,
     overwrite_option,
     pipeline_options,
+    resuming_run_options,
     run_options,
 )
 from corrsfm.cli.sections import SectionedCommand
@@ -29,10 +31,8 @@ if TYPE_CHECKING:
 
 __all__ = ["extract", "match", "pairs", "prune", "reconstruct", "report", "run"]
 
-PHOTOS = click.argument(
-    "photos", metavar="PHOTOS...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
-WORKSPACE = click.argument("workspace_dir", metavar="WORKSPACE", type=click.Path(path_type=Path))
+PHOTOS = click.argument("photos", metavar="PHOTOS...", nargs=-1, required=True, type=PATH)
+WORKSPACE = click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
 
 
 def _show(outcomes: Sequence[StageOutcome], as_json: bool) -> None:
@@ -60,7 +60,7 @@ def _step(
 @config_options(
     images=cfg.ImagesConfig, features=cfg.FeaturesConfig, pairs=cfg.PairsConfig, matches=cfg.MatchesConfig
 )
-@run_options
+@resuming_run_options
 @overwrite_option
 @json_option
 def extract(
@@ -81,12 +81,13 @@ def extract(
     and finds the nearest neighbour of every keypoint, with its distance ratio and a mutual flag.
     """
     from corrsfm import pipeline
+    from corrsfm.cluster import connected
     from corrsfm.images.sources import whole_folder
     from corrsfm.workspace import Workspace
 
     pipeline.check_options(run, features=features, matches=matches, workspace_dir=workspace_dir)
     workspace = Workspace(workspace_dir, create=True, images_dir=whole_folder(photos))
-    with workspace.lock():
+    with workspace.lock(), connected(run.cluster, run.workers):
         outcomes = [
             pipeline.index_photos(workspace, photos, images, run, overwrite=overwrite),
             pipeline.extract_features(workspace, features, run, overwrite=overwrite),
@@ -114,7 +115,7 @@ def pairs(
 @click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.MatchesConfig)
-@run_options
+@resuming_run_options
 @overwrite_option
 @json_option
 def match(
@@ -132,7 +133,7 @@ def match(
 @click.command(cls=SectionedCommand)
 @WORKSPACE
 @config_options(config=cfg.PruneConfig, database=cfg.DatabaseConfig)
-@run_options
+@resuming_run_options
 @overwrite_option
 @json_option
 def prune(
@@ -199,6 +200,7 @@ def report(workspace_dir: Path, as_json: bool) -> None:
 @PHOTOS
 @WORKSPACE
 @pipeline_options
+@click.option("--wait", is_flag=True, help="Wait for another corrsfm that works in the workspace.")
 @overwrite_option
 @json_option
 def run(
@@ -206,6 +208,7 @@ def run(
     workspace_dir: Path,
     config: cfg.PipelineConfig,
     overwrite: bool,
+    wait: bool,
     as_json: bool,
 ) -> None:
     """Do everything, from photos to a report.
@@ -217,7 +220,7 @@ def run(
     from corrsfm.pipeline import run_scene
 
     warned = click.get_current_context().meta.get(WARNED_KEY, [])
-    result = run_scene(photos, workspace_dir, config, overwrite=overwrite, warned=warned)
+    result = run_scene(photos, workspace_dir, config, overwrite=overwrite, wait=wait, warned=warned)
     _show_report(result, as_json, workspace_dir)
 
 

@@ -26,6 +26,8 @@ _DROP_OTHERS = f"""
     DELETE FROM frames WHERE frame_id NOT IN (SELECT frame_id FROM frame_data);
     DELETE FROM images WHERE image_id NOT IN kept;
     DROP TABLE kept;
+    DROP TABLE IF EXISTS corrsfm_about;
+    DROP TABLE IF EXISTS corrsfm_pairs;
 """
 
 _SCHEMA_3_8 = f"""

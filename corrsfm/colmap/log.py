@@ -6,12 +6,14 @@ The log is one per process (glog), so `colmap_log` is not for use from several t
 from __future__ import annotations
 
 import contextlib
+import shutil
 import signal
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import pycolmap
+
+from corrsfm.files import make_folder
 
 __all__ = ["colmap_log", "pycolmap_version"]
 
@@ -44,9 +46,9 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
         if log_file is None:
             yield
         else:
-            with tempfile.TemporaryDirectory(prefix="corrsfm-log-") as folder:
+            with _folder_beside(log_file) as folder:
                 # One file for all levels: messages of a level go to the files of all lower levels, too.
-                log.set_log_destination(log.INFO, str(Path(folder) / "colmap."))
+                log.set_log_destination(log.INFO, str(folder / "colmap."))
                 for level in (log.WARNING, log.ERROR, log.FATAL):
                     log.set_log_destination(level, "")
                 try:
@@ -54,9 +56,21 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
                 finally:
                     # Closing the destination flushes it.
                     log.set_log_destination(log.INFO, "")
-                    _append(sorted(Path(folder).iterdir()), log_file)
+                    _append(sorted(folder.iterdir()), log_file)
     finally:
         log.minloglevel, log.alsologtostderr, log.logtostderr, log.stderrthreshold = before
+
+
+@contextlib.contextmanager
+def _folder_beside(log_file: Path) -> Iterator[Path]:
+    """An empty folder with a name of its own, so that what a killed process left is found and removed."""
+    folder = log_file.with_name(f".{log_file.name}.partial")
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _give_back_termination() -> None:

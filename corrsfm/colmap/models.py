@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.files import read_bytes
 from corrsfm.geometry import Pose
 from corrsfm.types import ModelSummary
 
@@ -25,6 +28,10 @@ __all__ = [
 
 # Where a folder may keep its model: a workspace's first one, COLMAP's own habits.
 _PLACES = (".", "sparse/0", "sparse", "model", "0")
+
+
+# What pycolmap raises on damaged bytes.
+_UNREADABLE = (RuntimeError, ValueError, LookupError, MemoryError, TypeError, OSError)
 
 
 def is_model(folder: Path) -> bool:
@@ -62,10 +69,53 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         If it cannot be read.
     """
     try:
-        with colmap_log():
-            return pycolmap.Reconstruction(str(folder))
-    except (RuntimeError, ValueError) as error:
+        return _read(folder)
+    except _UNREADABLE as error:
         raise InputError(f"{folder}: COLMAP model cannot be read ({error})") from error
+
+
+def _read(folder: Path) -> pycolmap.Reconstruction:
+    for path in folder.glob("*.bin"):
+        # pycolmap makes room for as many as the file promises, and makes up what is missing at its end.
+        content = read_bytes(path)
+        promised = int.from_bytes(content[:8], "little")
+        if len(content) < 8 or promised > len(content):
+            raise ValueError(f"{path.name} promises {promised} entries in {len(content)} bytes")
+        if path.name in _SIZES:
+            _check_end(path.name, content, promised)
+    with colmap_log():
+        return pycolmap.Reconstruction(str(folder))
+
+
+def _size_of_image(content: bytes, start: int) -> int:
+    name_end = content.index(b"\0", start + 64) + 1
+    (num_points,) = struct.unpack_from("<Q", content, name_end)
+    return int(name_end - start + 8 + 24 * num_points)
+
+
+def _size_of_point(content: bytes, start: int) -> int:
+    (track_length,) = struct.unpack_from("<Q", content, start + 43)
+    return int(51 + 8 * track_length)
+
+
+# Bytes of an entry that begins at a place of a file, as COLMAP describes its binary format: photo id, pose,
+# camera id, name, points; point id, position, colour, error, track.
+_SIZES: dict[str, Callable[[bytes, int], int]] = {
+    "images.bin": _size_of_image,
+    "points3D.bin": _size_of_point,
+}
+
+
+def _check_end(name: str, content: bytes, num_entries: int) -> None:
+    """Raise `ValueError` unless a binary file ends where its last entry does."""
+    place = 8
+    try:
+        for _ in range(num_entries):
+            place += _SIZES[name](content, place)
+    except (struct.error, ValueError, OverflowError) as error:
+        raise ValueError(f"{name} ends within an entry") from error
+    if place != len(content):
+        raise ValueError(f"{name} has {len(content)} bytes, and its entries {place}")
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[str, Pose]:
@@ -91,9 +141,8 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
     models: list[pycolmap.Reconstruction] = []
     while (path := folder / str(len(models))).is_dir():
         try:
-            with colmap_log():
-                models.append(pycolmap.Reconstruction(path))
-        except (RuntimeError, ValueError) as error:
+            models.append(_read(path))
+        except _UNREADABLE as error:
             raise WorkspaceError(
                 f"{path}: is not a readable COLMAP model; try: corrsfm reconstruct --overwrite"
             ) from error

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.colmap.sqlite import PAIR_BASE, open_for_reading
+from corrsfm.colmap.sqlite import PAIR_BASE, id_of_pair, open_for_reading
 from corrsfm.errors import DatabaseError
 from corrsfm.types import Pair, VerifiedPair
 
@@ -123,5 +123,4 @@ def _names_of_pair(names: dict[int, str], pair_id: int, path: Path) -> Pair:
 def _ids_of_pairs(names: dict[int, str], pairs: Iterable[Pair]) -> set[int]:
     """Ids of those pairs whose photos are both known."""
     ids = {name: image_id for image_id, name in names.items()}
-    known = [sorted((ids[name0], ids[name1])) for name0, name1 in pairs if name0 in ids and name1 in ids]
-    return {PAIR_BASE * id0 + id1 for id0, id1 in known}
+    return {id_of_pair(ids[name0], ids[name1]) for name0, name1 in pairs if name0 in ids and name1 in ids}

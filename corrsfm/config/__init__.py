@@ -1,6 +1,15 @@
 """The options of every stage, and how flags, TOML files and hashes come from the same fields."""
 
-from corrsfm.config.fields import LARGEST_INT, config_hash, from_dict, option, to_dict
+from corrsfm.config.fields import (
+    LARGEST_INT,
+    absolute,
+    config_hash,
+    encoded,
+    from_dict,
+    hash_encoded,
+    option,
+    to_dict,
+)
 from corrsfm.config.stages import (
     CameraMode,
     DatabaseConfig,
@@ -55,8 +64,11 @@ __all__ = [
     "PruneMethod",
     "ReconstructionConfig",
     "RunConfig",
+    "absolute",
     "config_hash",
+    "encoded",
     "from_dict",
+    "hash_encoded",
     "load_pipeline",
     "option",
     "to_dict",

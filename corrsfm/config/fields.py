@@ -6,19 +6,36 @@ import dataclasses
 import hashlib
 import json
 import math
+import os
 import tomllib
 import types
 import typing
 from enum import StrEnum
+from json.encoder import encode_basestring_ascii
 from pathlib import Path
 from typing import Any, TypeVar
 
-from corrsfm.errors import ConfigError
+from corrsfm.errors import ConfigError, InputError
+from corrsfm.files import read_text, why_unusable
 
-__all__ = ["LARGEST_INT", "config_hash", "flag_of", "flags_of", "from_dict", "load_toml", "option", "to_dict"]
+__all__ = [
+    "LARGEST_INT",
+    "absolute",
+    "config_hash",
+    "encoded",
+    "flag_of",
+    "flags_of",
+    "from_dict",
+    "hash_encoded",
+    "load_toml",
+    "option",
+    "to_dict",
+]
 
 LARGEST_INT = 2**31 - 1
 """What native code counts in."""
+
+_LARGEST_TOML_BYTES = 1 << 24
 
 T = TypeVar("T")
 
@@ -76,7 +93,11 @@ def _convert(annotation: Any, value: Any) -> Any:
         return None if value is None else _convert(inner[0], value)
     if origin is tuple:
         items = [value] if isinstance(value, str) else value
-        return tuple(_convert(typing.get_args(annotation)[0], item) for item in items)
+        inner = typing.get_args(annotation)[0]
+        # Of choices at least one is made; a list of files may be empty.
+        if not items and isinstance(inner, type) and issubclass(inner, StrEnum):
+            raise ValueError
+        return tuple(_convert(inner, item) for item in items)
     if isinstance(annotation, type) and issubclass(annotation, StrEnum):
         return annotation(value)
     if origin is typing.Literal:
@@ -84,7 +105,10 @@ def _convert(annotation: Any, value: Any) -> Any:
             raise ValueError
         return value
     if annotation is Path:
-        return Path(value)
+        path = Path(value)
+        if why_unusable(os.fspath(value)):
+            raise ValueError
+        return path
     if annotation is float and type(value) is int:
         return float(value)
     if type(value) is not annotation:
@@ -161,7 +185,7 @@ def _expected_instead(entry: dataclasses.Field, value: Any) -> str:
     minimum, above, maximum = (entry.metadata.get(key) for key in ("minimum", "above", "maximum"))
     if maximum is None and type(value) is int:
         maximum = LARGEST_INT
-    if not math.isfinite(value):
+    if type(value) is float and not math.isfinite(value):
         return "a finite number"
     if minimum is not None and value < minimum:
         return f"at least {minimum}"
@@ -187,13 +211,36 @@ def to_dict(config: Any, *, only_result: bool = False) -> dict[str, Any]:
     return values
 
 
+def absolute(config: T) -> T:
+    """A config whose files are named by absolute paths, for a process in another folder."""
+    paths = {
+        entry.name: value.absolute()
+        for entry in dataclasses.fields(config)  # type: ignore[arg-type]
+        # What is no file may be the name of something that comes with the package.
+        if isinstance(value := getattr(config, entry.name), Path) and value.is_file()
+    }
+    return dataclasses.replace(config, **paths)  # type: ignore[type-var]
+
+
 def config_hash(*parts: Any) -> str:
     """Hex digest of configs, strings, numbers and nested lists of them; equal values give equal digests.
 
     Options that do not affect results are left out.
     """
-    plain = [to_dict(part, only_result=True) if dataclasses.is_dataclass(part) else part for part in parts]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True, default=str).encode()).hexdigest()
+    return hash_encoded(*map(encoded, parts))
+
+
+def encoded(part: Any) -> str:
+    """A part of `config_hash` as text, for `hash_encoded`; where millions of hashes share it, made once."""
+    if type(part) is str:
+        return encode_basestring_ascii(part)
+    plain = to_dict(part, only_result=True) if dataclasses.is_dataclass(part) else part
+    return json.dumps(plain, sort_keys=True, default=str)
+
+
+def hash_encoded(*texts: str) -> str:
+    """`config_hash` of parts that `encoded` made texts of."""
+    return hashlib.sha256(f"[{', '.join(texts)}]".encode()).hexdigest()
 
 
 def flag_of(name: str) -> str:
@@ -232,12 +279,12 @@ def load_toml(path: Path, what: str) -> dict[str, Any]:
         If the file is missing, cannot be read or is not TOML.
     """
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path}: no such file; expected {what} in TOML") from error
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror}); expected {what} in TOML") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        return tomllib.loads(read_text(path, largest_bytes=_LARGEST_TOML_BYTES))
+    except InputError as error:
+        raise ConfigError(f"{error}; expected {what} in TOML") from error
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     except RecursionError as error:
         raise ConfigError(f"{path}: its values are nested too deep; expected {what}") from error
+    except ValueError as error:  # a number of thousands of digits
+        raise ConfigError(f"{path}: holds a value that cannot be read ({error}); expected {what}") from error

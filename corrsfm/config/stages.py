@@ -369,6 +369,21 @@ class RunConfig:
     seed: int = option(0, "Seed of everything random", minimum=0)
     device: str = option("auto", "auto, cpu, cuda or cuda:N", affects_result=False)
     threads: int = option(0, "Threads to use; 0 for all cores", minimum=0, maximum=1024, affects_result=False)
+    verify: bool = option(
+        False, "Read finished features and matches and make damaged ones again", affects_result=False
+    )
+    cluster: str | None = option(
+        None,
+        "Address of a Dask scheduler whose workers extract, match and prune; they see the same files",
+        affects_result=False,
+    )
+    workers: int = option(
+        0,
+        "Extract, match and prune in so many processes instead",
+        minimum=0,
+        maximum=1024,
+        affects_result=False,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

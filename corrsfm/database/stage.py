@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import heapq
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +16,20 @@ from numpy.typing import NDArray
 from corrsfm import config as cfg
 from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.colmap.log import pycolmap_version
-from corrsfm.colmap.sqlite import is_truncated
+from corrsfm.colmap.sqlite import find_damage, is_truncated
 from corrsfm.config import config_hash
 from corrsfm.database.cameras_by_votes import assign_by_votes, cameras_that_vote
 from corrsfm.database.focal_evidence import PairPoints
 from corrsfm.database.focal_votes import VoteDecision, count_votes
-from corrsfm.database.write import write_database
+from corrsfm.database.write import update_database, write_database
 from corrsfm.files import atomic_write_json
 from corrsfm.machine import count_threads
-from corrsfm.types import Camera, Features, ImageRecord, Pair
+from corrsfm.types import Camera, Features, ImageRecord, Pair, check_indices
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, PRUNED, PrunedMatches
+from corrsfm.workspace.items import PrunedMatches
 from corrsfm.workspace.lists import Index, read_index, read_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, pruned_of
 from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["fingerprint_of", "verify_matches"]
@@ -49,9 +52,9 @@ def verify_matches(
     voting = _cameras_that_vote(workspace, index)
     fingerprint = fingerprint_of(workspace, config, run.seed)
     pair_list = read_pairs(workspace)
-    damaged = workspace.database.is_file() and is_truncated(workspace.database)
+    damaged = _damage(workspace.database, thorough=run.verify)
     if damaged:
-        logger.warning("%s: damaged, its end is missing; it is written again", workspace.database)
+        logger.warning("%s: damaged (%s); it is written again", workspace.database, damaged)
     current = workspace.is_current("verified matches", fingerprint, workspace.database)
     if current and not overwrite and not damaged:
         return StageOutcome(
@@ -61,8 +64,8 @@ def verify_matches(
         explain(workspace, "verified matches", config)
     workspace.forget("verified matches")
     with (
-        ItemStore(workspace.features, FEATURES).reader() as read_features,
-        ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
+        features_of(workspace).reader() as read_features,
+        pruned_of(workspace).reader() as read_pruned,
     ):
         records, cameras, remarks = _decide_cameras(
             workspace, index, voting, read_features, read_pruned, pair_list.pairs, run.seed
@@ -70,22 +73,48 @@ def verify_matches(
         atomic_write_json(workspace.cameras_json, {"remarks": remarks})
         for remark in remarks:
             logger.info("%s", remark)
-        write_database(
-            workspace.database,
-            images=records,
-            cameras=cameras,
-            features=read_features,
-            kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
-            config=config,
-            seed=run.seed,
-            num_threads=count_threads(run.threads),
-            log_file=workspace.log,
-        )
+        features = workspace.require("features").fingerprint
+        base = config_hash("database", pycolmap_version(), features, records, cameras, config, run.seed)
+        settings: dict[str, Any] = {
+            "base": base,
+            "fingerprints": pruned_of(workspace).fingerprints(pair_list.pairs),
+            "cameras": cameras,
+            "config": config,
+            "seed": run.seed,
+            "num_threads": count_threads(run.threads),
+            "log_file": workspace.log,
+        }
+        num_changed = None
+        if not (overwrite or damaged):
+            num_changed = update_database(
+                workspace.database, kept=lambda pair: read_pruned(pair).indices, **settings
+            )
+        if num_changed is None:
+            num_changed = len(pair_list)
+            write_database(
+                workspace.database,
+                images=records,
+                features=read_features,
+                kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
+                **settings,
+            )
     outcome = StageOutcome(
-        stage="verified matches", num_items=len(pair_list), seconds=time.monotonic() - started
+        stage="verified matches",
+        num_items=len(pair_list),
+        num_reused=len(pair_list) - num_changed,
+        seconds=time.monotonic() - started,
     )
     finish(workspace, outcome, fingerprint, config, inputs={"pruned matches": pruned.fingerprint})
     return outcome
+
+
+def _damage(path: Path, *, thorough: bool) -> str:
+    """What is wrong with a database; empty if nothing is or there is none."""
+    if not path.is_file():
+        return ""
+    if is_truncated(path):
+        return "its end is missing"
+    return find_damage(path) if thorough else ""
 
 
 def fingerprint_of(workspace: Workspace, config: cfg.DatabaseConfig, seed: int) -> str:
@@ -122,12 +151,13 @@ def _decide_cameras(
     """Assign cameras by the votes of the kept matches, with a remark on each decision."""
     # Sharing that the user asked for is not undone.
     asked_for = workspace.require("images").config["camera_mode"] != cfg.CameraMode.AUTO
+    camera_of = {record.name: index.camera_of(record) for record in index.records}
     votes = {}
     for ids in voting:
         camera = index.cameras[ids[0]]
         names = {record.name for record in index.records if record.camera_id in ids}
         points = [
-            _centred_points(index, pair, read_features, read_kept(pair).indices)
+            _centred_points(camera_of, pair, read_features, read_kept(pair).indices)
             for pair in _strongest(workspace, [pair for pair in pairs if names.issuperset(pair)])
         ]
         counted = count_votes(points, max(camera.width, camera.height), seed=seed, may_split=not asked_for)
@@ -144,21 +174,24 @@ def _decide_cameras(
 
 def _strongest(workspace: Workspace, pairs: list[Pair]) -> list[Pair]:
     """The pairs with most kept matches, as many as voting can use."""
-    counts = {
-        pair: int(values["num_kept"])
-        for pair, values in ItemStore(workspace.pruned, PRUNED).attributes(pairs)
-    }
-    return sorted(sorted(pairs, key=lambda pair: (-counts[pair], pair))[:MAX_PAIRS_ASKED])
+    store = pruned_of(workspace)
+    # What is chosen is read with its checksum.
+    counts = store.counts("num_kept")
+    num_kept = {pair: counts.get(store.kind.key(pair), 0) for pair in pairs}
+    return sorted(heapq.nsmallest(MAX_PAIRS_ASKED, pairs, key=lambda pair: (-num_kept[pair], pair)))
 
 
 def _centred_points(
-    index: Index, pair: Pair, read_features: Callable[[str], Features], matches: NDArray[np.int32]
+    camera_of: Mapping[str, Camera],
+    pair: Pair,
+    read_features: Callable[[str], Features],
+    matches: NDArray[np.int32],
 ) -> PairPoints:
     """Matched points of a pair in pixels from the principal points."""
-    record_of = {record.name: record for record in index.records}
+    keypoints = [read_features(name).keypoints for name in pair]
+    check_indices(pair, matches, (len(keypoints[0]), len(keypoints[1])))
     sides = []
     for side, name in enumerate(pair):
-        _, _, *centre = pinhole_parameters(index.camera_of(record_of[name]))
-        keypoints = read_features(name).keypoints[matches[:, side]].astype(np.float64)
-        sides.append(keypoints - np.array(centre))
+        _, _, *centre = pinhole_parameters(camera_of[name])
+        sides.append(keypoints[side][matches[:, side]].astype(np.float64) - np.array(centre))
     return PairPoints(name0=pair[0], name1=pair[1], points0_px=sides[0], points1_px=sides[1])

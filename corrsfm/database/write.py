@@ -8,7 +8,7 @@ is `pycolmap.geometric_verification`, which estimates geometries from the stored
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +17,22 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap, to_pycolmap, write_camera
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import copy_database, database_errors, is_sqlite
+from corrsfm.colmap.sqlite import copy_database, database_errors, id_of_pair, is_sqlite
 from corrsfm.config import DatabaseConfig
-from corrsfm.database.verification import default_verification_error_px, verify_pairs
+from corrsfm.database.record import forget_pairs, image_ids, recorded_pairs, remember_pairs
+from corrsfm.database.verification import (
+    default_verification_error_px,
+    verify_few_pairs,
+    verify_pairs,
+)
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
-from corrsfm.types import Camera, Features, ImageRecord
+from corrsfm.types import Camera, Features, ImageRecord, Pair, check_indices
 
-__all__ = ["add_to_database", "write_database"]
+__all__ = ["add_to_database", "update_database", "write_database"]
+
+# Of the pairs; with more, writing all is as quick and leaves no gaps in the file.
+MOST_CHANGED = 0.5
 
 
 def write_database(
@@ -38,6 +46,8 @@ def write_database(
     seed: int = 0,
     num_threads: int = 0,
     log_file: Path | None = None,
+    base: str = "",
+    fingerprints: Mapping[Pair, str] | None = None,
 ) -> None:
     """Write and verify a database; it appears at ``path`` whole or not at all.
 
@@ -60,6 +70,9 @@ def write_database(
         Threads of the verification, on which results do not depend; 0 for all cores.
     log_file : Path, optional
         Where pycolmap's messages are appended.
+    base, fingerprints : str and mapping, optional
+        What `update_database` will compare with: a fingerprint of all that is the same for every pair, and
+        of the kept matches of each.
 
     Raises
     ------
@@ -76,6 +89,73 @@ def write_database(
             _fill(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
             _verify(temporary, cameras, config, seed, num_threads)
+        if fingerprints is not None:
+            remember_pairs(temporary, base, fingerprints)
+
+
+def update_database(
+    path: Path,
+    *,
+    base: str,
+    fingerprints: Mapping[Pair, str],
+    kept: Callable[[Pair], NDArray[np.int32]],
+    cameras: Sequence[Camera],
+    config: DatabaseConfig,
+    seed: int = 0,
+    num_threads: int = 0,
+    log_file: Path | None = None,
+) -> int | None:
+    """Write and verify the pairs of a database that changed, in place; it then equals one written anew.
+
+    Killed on the way, the same call finishes it.
+
+    Parameters
+    ----------
+    path : Path
+    base, fingerprints
+        As they would be given to `write_database`.
+    kept : callable
+        Pair → (K, 2) indices of its kept matches.
+    cameras, config, seed, num_threads, log_file
+        As for `write_database`.
+
+    Returns
+    -------
+    int or None
+        Number of pairs that changed; None if the database has to be written anew: there is none, it was made
+        from other photos or with other options, another program took photos away, or most of it changed.
+
+    Raises
+    ------
+    InputError, DatabaseError
+        As `write_database`.
+    """
+    if not path.is_file():
+        return None
+    _check_not_in_use(path)
+    recorded = recorded_pairs(path, base)
+    if not recorded:
+        return None
+    ids = image_ids(path)
+    if not all(ids.keys() >= set(pair) for pair in fingerprints):
+        return None
+    wanted = {id_of_pair(ids[name0], ids[name1]): (name0, name1) for name0, name1 in fingerprints}
+    changed = {number: pair for number, pair in wanted.items() if recorded.get(number) != fingerprints[pair]}
+    if len(changed) > len(wanted) * MOST_CHANGED:
+        return None
+    forget_pairs(path, (recorded.keys() - wanted.keys()) | changed.keys())
+    if changed:
+        with colmap_log(), database_errors(path), _transaction(path) as database:
+            num_keypoints = {
+                name: database.num_keypoints_for_image(ids[name])
+                for pair in changed.values()
+                for name in pair
+            }
+            _write_pairs(database, ids, num_keypoints, ((*pair, kept(pair)) for pair in changed.values()))
+        with colmap_log(log_file), database_errors(path):
+            _verify(path, cameras, config, seed, num_threads, few=changed)
+        remember_pairs(path, base, {pair: fingerprints[pair] for pair in changed.values()})
+    return len(changed)
 
 
 def add_to_database(
@@ -122,11 +202,21 @@ def add_to_database(
 
 
 def _verify(
-    path: Path, cameras: Sequence[Camera], config: DatabaseConfig, seed: int, num_threads: int
+    path: Path,
+    cameras: Sequence[Camera],
+    config: DatabaseConfig,
+    seed: int,
+    num_threads: int,
+    *,
+    few: Collection[int] | None = None,
 ) -> None:
-    """Verify the pairs of a database that have no geometry yet."""
+    """Verify the pairs of a database that have no geometry yet, or only a few, by their ids."""
     max_error_px = config.verification_error_px or default_verification_error_px(cameras)
-    verify_pairs(path, config.min_num_inliers, max_error_px, seed, num_threads)
+    settings = (config.min_num_inliers, max_error_px, seed, num_threads)
+    if few is None:
+        verify_pairs(path, *settings)
+    else:
+        verify_few_pairs(path, few, *settings)
 
 
 @contextlib.contextmanager
@@ -294,12 +384,6 @@ def _check_pair(
         raise InputError(
             f"{pair}: matches are {indices.dtype} of shape {indices.shape}, expected integers (K, 2)"
         )
-    for name, column in ((name0, indices[:, 0]), (name1, indices[:, 1])):
-        if len(column) and (column.min() < 0 or column.max() >= num_keypoints[name]):
-            wrong = int(column.min() if column.min() < 0 else column.max())
-            raise InputError(
-                f"{pair}: a match uses keypoint {wrong} of {name}, which has {num_keypoints[name]}; "
-                "the matches belong to other features, match and prune again"
-            )
+    check_indices((name0, name1), indices, (num_keypoints[name0], num_keypoints[name1]))
     if database.exists_matches(image_ids[name0], image_ids[name1]):
         raise InputError(f"{pair}: occurs twice; remove one of them from the list of pairs")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import InputError
 from corrsfm.evaluation.metrics import POSE_THRESHOLDS_DEG, Interval, auc_contributions, bootstrap_mean
-from corrsfm.files import atomic_write_text
+from corrsfm.files import atomic_write_text, read_text
 from corrsfm.machine import count_threads, versions
 
 __all__ = [
@@ -109,9 +109,9 @@ def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:
         If it is missing, damaged, of another version or of another kind than wanted.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(read_text(path))
         version, found = values["format_version"], values["kind"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(
             f"{path}: not a result file ({error}); make it with: corrsfm evaluate, or delete it"
         ) from error

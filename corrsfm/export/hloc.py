@@ -7,13 +7,15 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from corrsfm.colmap.databases import copy_photos_of
 from corrsfm.files import atomic_write_text
+from corrsfm.types import Features, check_indices
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, PRUNED
+from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys, pair_group
 from corrsfm.workspace.lists import read_pairs
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, pruned_of
 
 __all__ = ["write_hloc"]
 
@@ -29,33 +31,54 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
     model : pycolmap.Reconstruction
     workspace : Workspace
     folder : Path
+
+    Raises
+    ------
+    InputError
+        If hloc's layout cannot tell two photos apart.
     """
     names = sorted(image.name for image in model.images.values())
+    check_hloc_keys(names)
     num_keypoints = {}
     with (
-        ItemStore(workspace.features, FEATURES).reader() as read,
+        features_of(workspace).reader() as read,
         h5py.File(folder / "features.h5", "w") as file,
     ):
         for name in names:
             features = read(name)
             num_keypoints[name] = len(features.keypoints)
-            arrays, _ = FEATURES.encode(features)
-            for key, value in arrays.items():
+            for key, value in _arrays(features).items():
                 file[f"{name}/{key}"] = value
     held = set(names)
     pairs = [pair for pair in read_pairs(workspace).pairs if held >= set(pair)]
     with (
-        ItemStore(workspace.pruned, PRUNED).reader() as read_kept,
+        pruned_of(workspace).reader() as read_kept,
         h5py.File(folder / "matches.h5", "w") as file,
     ):
         for pair in pairs:
             kept, num = read_kept(pair), num_keypoints[pair[0]]
+            check_indices(pair, kept.indices, (num, num_keypoints[pair[1]]))
             matches, scores = np.full(num, -1, np.int32), np.zeros(num, np.float32)
             matches[kept.indices[:, 0]] = kept.indices[:, 1]
             scores[kept.indices[:, 0]] = kept.scores
-            file[f"{PRUNED.group(pair)}/matches0"] = matches
-            file[f"{PRUNED.group(pair)}/matching_scores0"] = scores
+            file[f"{pair_group(pair)}/matches0"] = matches
+            file[f"{pair_group(pair)}/matching_scores0"] = scores
     atomic_write_text(folder / "pairs.txt", "".join(f"{name0} {name1}\n" for name0, name1 in pairs))
     (folder / "sfm").mkdir()
     model.write_binary(folder / "sfm")
     copy_photos_of(workspace.database, folder / "sfm" / "database.db", names)
+
+
+def _arrays(features: Features) -> dict[str, NDArray]:
+    """Features in hloc's layout; SIFT's descriptors as vectors of unit length."""
+    descriptors = features.descriptors.astype(np.float16)
+    if features.descriptors.dtype == np.uint8:
+        descriptors /= np.float16(512)
+    arrays = {
+        "keypoints": features.keypoints - HALF_PIXEL,
+        "scores": features.scores,
+        "descriptors": np.ascontiguousarray(descriptors.T),
+        "image_size": np.asarray(features.image_size, np.int32),
+    }
+    shapes = {"scales": features.scales, "oris": features.orientations}
+    return arrays | {name: values for name, values in shapes.items() if values is not None}

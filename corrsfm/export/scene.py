@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -12,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
-from corrsfm.colmap.models import poses_of, read_models
+from corrsfm.colmap.models import poses_of
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.export import ExportTarget
 from corrsfm.export.colmap import write_colmap, write_colmap3
@@ -23,11 +22,12 @@ from corrsfm.export.photos import check_photos
 from corrsfm.export.tables import write_csv, write_ply
 from corrsfm.export.trainers import write_nerfstudio, write_splat
 from corrsfm.export.world import common_up, crop_to_bulk, held_upright, scale_of, similarity, turn_to_z
-from corrsfm.files import atomic_path
+from corrsfm.files import atomic_path, read_json
 from corrsfm.geometry import Pose
 from corrsfm.images.photos import read_photo_info
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.models import models_of
 
 __all__ = ["ExportResult", "export_scene"]
 
@@ -126,7 +126,7 @@ def export_scene(
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
     index = read_index(source)
-    model = read_models(source.sparse)[0]
+    model = models_of(source)[0]
     names = tuple(poses_of(model))
     if target in _NO_SPACES and (spaced := [name for name in names if " " in name]):
         raise InputError(
@@ -228,7 +228,7 @@ def _check_output(path: Path, workspace: Workspace, photos: Path, *, is_file: bo
 def _verdict_of(workspace: Workspace) -> str | None:
     """The grade of the model; logged with reasons and a next step unless it is good."""
     try:
-        verdict = json.loads(workspace.evidence.read_text(encoding="utf-8"))["verdict"]
+        verdict = read_json(workspace.evidence)["verdict"]
         grade, reasons, steps = verdict["grade"], verdict["reasons"], verdict["next_steps"]
     except (OSError, ValueError, KeyError, TypeError):
         return None

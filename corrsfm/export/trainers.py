@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from corrsfm.colmap.models import poses_of
 from corrsfm.export.colmap import write_three_files
 from corrsfm.export.photos import copy_photos, crop_to_principal_point, flat_names, undistort
+from corrsfm.export.tables import write_ply
 from corrsfm.export.world import similarity
 from corrsfm.files import atomic_write_json
 
@@ -75,7 +76,7 @@ def write_nerfstudio(
         "applied_transform": np.column_stack([turn, np.zeros(3)]).tolist(),
     }
     if turned.num_points3D():
-        turned.export_PLY(folder / "sparse_pc.ply")
+        write_ply(turned, folder / "sparse_pc.ply")
         values["ply_file_path"] = "sparse_pc.ply"
     atomic_write_json(folder / "transforms.json", values)
 

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Iterator
+import os
+from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
 from corrsfm import config as cfg
+from corrsfm.cluster import connected
 from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
-from corrsfm.errors import ImageError
+from corrsfm.errors import ClusterError, CorrsfmError, ImageError
 from corrsfm.features import algorithm_of, create_extractor, reads_colour
 from corrsfm.images.photos import read_colour, read_image, read_mask
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.imported import (
     imported_features,
     imported_from,
-    refuse_foreign,
     traits_to_come,
 )
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.shards import make_items
+from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["extract_features"]
@@ -52,8 +54,7 @@ def extract_features(
     """
     index = read_index(workspace)
     images = workspace.require("images")
-    store = ItemStore(workspace.features, FEATURES)
-    refuse_foreign(workspace.features, FEATURES)
+    store = features_of(workspace)
     if (source := imported_from(workspace, "features")) is not None:
         traits_to_come(workspace, config, cfg.MatchesConfig())
         return complete(
@@ -74,31 +75,19 @@ def extract_features(
     }
     of_left_out = {name: mark_left_out(fingerprint) for name, fingerprint in wanted.items()}
     records = {record.name: record for record in index.records}
-    device = find_device(run.device) if config.extractor.kind != cfg.FeatureKind.SIFT else "cpu"
-    extract = create_extractor(config, device)
-    read = read_colour if reads_colour(config.extractor) else read_image
-    mask_dir = images.config.get("mask_dir")
-    unreadable: list[str] = []
-
-    def work(name: str) -> Features | ImageError:
-        record = records[name]
-        try:
-            image = read(workspace.images_dir / name)
-            mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
-            return extract(image, mask)
-        except ImageError as error:
-            return error
-
-    # On a CPU each photo takes one thread, on a GPU one photo goes at a time.
-    num_at_once = count_threads(run.threads) if device == "cpu" else 1
     if config.extractor.kind != cfg.FeatureKind.SIFT:
-        use_threads(1)
+        find_device(run.device)
+    mask_dir = os.path.abspath(images.config["mask_dir"]) if images.config.get("mask_dir") else None
+    work = functools.partial(_extract, config=cfg.absolute(config), mask_dir=mask_dir, algorithm=algorithm)
+    may_skip = bool(images.config.get("skip_unreadable"))
 
-    def produce(missing: list[str]) -> Iterator[tuple[str, Features]]:
-        for name, result in threaded(work, missing, num_at_once):
-            if isinstance(result, Features):
+    def produce(missing: list[str]) -> Iterator[tuple[str, Features | None]]:
+        unreadable = []
+        results = make_items(cluster, workspace, store, work, missing, records.__getitem__, wanted, run)
+        for name, result in results:
+            if not isinstance(result, CorrsfmError):
                 yield name, result
-            elif images.config.get("skip_unreadable"):
+            elif may_skip:
                 logger.warning("left out: %s", result)
                 wanted[name] = of_left_out[name]
                 yield name, _no_features(index, records[name])
@@ -106,15 +95,17 @@ def extract_features(
                 unreadable.append(str(result))
         if unreadable:
             raise ImageError(
-                "\n".join(unreadable)
+                "\n".join(sorted(unreadable))
                 + "\nremove or replace these photos and run again, or use --skip-unreadable; the features of "
                 "the others are kept"
             )
 
-    with colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext():
-        if images.config.get("skip_unreadable"):
-            for name in sorted(store.finished(of_left_out)):
-                if isinstance(result := work(name), ImageError):
+    log = colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext()
+    with connected(run.cluster, run.workers) as cluster, log:
+        if may_skip:
+            left_out = [records[name] for name in sorted(store.finished(of_left_out))]
+            for name, result in work(workspace, left_out, run) if left_out else ():
+                if isinstance(result, ImageError):
                     logger.warning("left out: %s", result)
                     wanted[name] = of_left_out[name]
         return complete(
@@ -127,7 +118,40 @@ def extract_features(
             inputs={"images": images.fingerprint},
             overwrite=overwrite,
             unit="photo",
+            verify=run.verify,
         )
+
+
+def _extract(
+    workspace: Workspace,
+    records: Iterable[ImageRecord],
+    run: cfg.RunConfig,
+    *,
+    config: cfg.FeaturesConfig,
+    mask_dir: str | None,
+    algorithm: str,
+) -> Iterator[tuple[str, Features | ImageError]]:
+    """Extract the features of photos, here or on a worker, which must have the same libraries."""
+    if algorithm_of(config) != algorithm:
+        raise ClusterError(f"extracts by {algorithm_of(config)}, the run by {algorithm}; install the same")
+    device = find_device(run.device) if config.extractor.kind != cfg.FeatureKind.SIFT else "cpu"
+    extract = create_extractor(config, device)
+    read = read_colour if reads_colour(config.extractor) else read_image
+
+    def work(record: ImageRecord) -> Features | ImageError:
+        try:
+            image = read(workspace.images_dir / record.name)
+            mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
+            return extract(image, mask)
+        except ImageError as error:
+            return error
+
+    # On a CPU each photo takes one thread, on a GPU one photo goes at a time.
+    num_at_once = count_threads(run.threads) if device == "cpu" else 1
+    if config.extractor.kind != cfg.FeatureKind.SIFT:
+        use_threads(1)
+    for record, result in threaded(work, records, num_at_once):
+        yield record.name, result
 
 
 def _no_features(index: Index, record: ImageRecord) -> Features:

@@ -9,7 +9,6 @@ the same options finds everything up to date.
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import tempfile
 import time
@@ -19,12 +18,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from corrsfm import config as cfg
-from corrsfm.colmap.models import read_models
 from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
 from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_write_json, read_json
 from corrsfm.finished.advice import next_step
 from corrsfm.finished.arrival import (
     Pending,
@@ -55,10 +53,10 @@ from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import Camera, Pair, PairList
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, PRUNED
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_index, write_pairs
+from corrsfm.workspace.models import models_of
 from corrsfm.workspace.resume import StageOutcome, finish, photos_left_out
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, pruned_of
 
 __all__ = ["AddResult", "AddedPhoto", "add_photos"]
 
@@ -189,7 +187,7 @@ def add_photos(
 def _with_seed(run: cfg.RunConfig, workspace: Workspace) -> cfg.RunConfig:
     """The seed of the scene's last run if none was asked for, so that its records keep fitting."""
     try:
-        seed = json.loads(workspace.run_json.read_text(encoding="utf-8"))["seed"]
+        seed = read_json(workspace.run_json)["seed"]
     except (OSError, ValueError, KeyError, TypeError):
         return run
     return dataclasses.replace(run, seed=run.seed or int(seed))
@@ -261,6 +259,11 @@ class _Addition:
         num_fresh = len(grown.records) - num_before
         if num_fresh:
             self._warn_of_names(grown, config)
+        # An interruption may have come between the list and its record.
+        is_current = workspace.is_current("images", index_fingerprint(grown), workspace.images_json)
+        if not is_current:
+            # Killed after this, the grown list is not taken for a damaged one; so with the pairs.
+            workspace.forget("images")
             write_index(workspace, grown)
         outcome = StageOutcome(
             stage="images",
@@ -269,8 +272,7 @@ class _Addition:
             seconds=time.monotonic() - started,
             skipped=not num_fresh,
         )
-        # An interruption may have come between the list and its record.
-        if not workspace.is_current("images", index_fingerprint(grown), workspace.images_json):
+        if not is_current:
             finish(workspace, outcome, index_fingerprint(grown), config)
         return outcome
 
@@ -315,7 +317,7 @@ class _Addition:
             return StageOutcome(stage="pairs", num_items=len(known), num_reused=len(known), skipped=True)
         left_out = photos_left_out(workspace, index.names)
         names = [name for name in index.names if name not in left_out]
-        with ItemStore(workspace.features, FEATURES).reader() as read_features:
+        with features_of(workspace).reader() as read_features:
             proposed = pairs_of_new_photos(
                 names,
                 [name for name in self._new if name not in left_out],
@@ -328,6 +330,7 @@ class _Addition:
         there = {frozenset(pair) for pair in known.pairs}
         origins |= {pair: (ORIGIN,) for pair in proposed if frozenset(pair) not in there}
         pairs = tuple(sorted(origins))
+        workspace.forget("pairs")
         write_pairs(workspace, PairList(pairs=pairs, origins=tuple(origins[pair] for pair in pairs)))
         outcome = StageOutcome(
             stage="pairs", num_items=len(pairs), num_reused=len(known), seconds=time.monotonic() - started
@@ -349,8 +352,8 @@ class _Addition:
         index = read_index(workspace)
         of_new = [pair for pair in pairs if not fresh.isdisjoint(pair)]
         with (
-            ItemStore(workspace.features, FEATURES).reader() as read_features,
-            ItemStore(workspace.pruned, PRUNED).reader() as read_pruned,
+            features_of(workspace).reader() as read_features,
+            pruned_of(workspace).reader() as read_pruned,
         ):
             cameras = cameras_of_new(workspace, index, self._new)
             self._remark_on(cameras)
@@ -377,8 +380,11 @@ class _Addition:
 
     def _remark_on(self, cameras: Mapping[str, tuple[int, Camera]]) -> None:
         """Put into `cameras.json` who of the new photos shares a camera of the model."""
-        path, model = self._workspace.cameras_json, read_models(self._workspace.sparse)[0]
-        remarks = json.loads(path.read_text(encoding="utf-8"))["remarks"] if path.is_file() else []
+        path, model = self._workspace.cameras_json, models_of(self._workspace)[0]
+        try:
+            remarks = list(read_json(path)["remarks"])
+        except (OSError, ValueError, KeyError, TypeError):
+            remarks = []
         shared = [name for name, (number, _) in cameras.items() if number in model.cameras]
         own = [name for name in cameras if name not in shared]
         for names, camera in ((shared, "the camera of photos like them"), (own, "cameras of their own")):

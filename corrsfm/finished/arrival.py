@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm.errors import InputError, WorkspaceError, first_few
-from corrsfm.files import atomic_path, sha256_of
+from corrsfm.files import atomic_path, read_json, sha256_of
 from corrsfm.finished.incoming import Incoming
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
@@ -53,12 +52,18 @@ def pending_addition(workspace: Workspace) -> Pending:
     Raises
     ------
     WorkspaceError
-        If nothing was interrupted and the scene has no current model.
+        If nothing was interrupted and the scene has no current model, or its database was damaged since.
     """
     try:
-        pending = Pending(**json.loads(workspace.adding.read_text(encoding="utf-8")))
+        pending = Pending(**read_json(workspace.adding))
     except FileNotFoundError:
         workspace.require("models")
+        # Photos are put into what is there, and cannot mend it; mapped again it would not be the same model.
+        if changed := workspace.changed_files("verified matches"):
+            raise WorkspaceError(
+                f"{first_few(map(str, changed))}: not as it was written; corrsfm check {workspace.root} says "
+                "how it is made again"
+            ) from None
         return Pending(
             photos={}, options={stage: workspace.require(stage).config for stage in STAGE_COMMANDS}
         )

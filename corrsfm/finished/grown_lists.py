@@ -12,7 +12,7 @@ import pycolmap
 from corrsfm import config as cfg
 from corrsfm.colmap.cameras import camera_from_pycolmap, with_focal_length
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.models import read_models
+from corrsfm.colmap.sqlite import database_errors
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.images.cache import PhotoCache
@@ -21,8 +21,8 @@ from corrsfm.images.listing import find_masks
 from corrsfm.reconstruction.resection import camera_in_model, focal_of_photos
 from corrsfm.types import Camera, ImageRecord
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import check_hloc_keys
 from corrsfm.workspace.lists import Index
+from corrsfm.workspace.models import models_of
 
 __all__ = ["cameras_of_new", "grown_index"]
 
@@ -61,7 +61,6 @@ def grown_index(
                 "again with corrsfm run"
             )
     names = sorted([*before, *fresh])
-    check_hloc_keys(names)
     infos = [cache.info_of(fresh.get(name, folder / name)) for name in names]
     proposed, groups = assign_cameras(
         names, infos, mode=config.camera_mode, model=config.camera_model, params=config.camera_params
@@ -108,8 +107,9 @@ def cameras_of_new(workspace: Workspace, index: Index, new: Sequence[str]) -> di
     A photo shares the camera of the photos that it is grouped with if all of them have one and the same in
     the model. Otherwise it gets its own, for which their focal lengths are the guess if there is no other.
     """
-    models = read_models(workspace.sparse)
-    with colmap_log(), pycolmap.Database.open(workspace.database) as database:
+    models = models_of(workspace)
+    path = workspace.database
+    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
         used = {camera.camera_id for camera in database.read_all_cameras()}
     free = max({*used, *(i for model in models for i in model.cameras)}, default=0) + 1
     records = {record.name: record for record in index.records}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import time
@@ -15,9 +14,8 @@ import pycolmap
 
 from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.models import read_models
 from corrsfm.colmap.pairs import read_verified_matches
-from corrsfm.files import atomic_path, atomic_write_json
+from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
 from corrsfm.reconstruction.calibration import adjustment_options
@@ -26,10 +24,10 @@ from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.resection import Resection
 from corrsfm.reconstruction.stage import fingerprint_of
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_added, read_index
+from corrsfm.workspace.models import models_of
 from corrsfm.workspace.resume import StageOutcome, finish
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 
 __all__ = ["ORIGIN", "grow_models"]
 
@@ -71,9 +69,9 @@ def grow_models(
     verified = workspace.require("verified matches")
     fingerprint = fingerprint_of(verified.fingerprint, config, run.seed)
     if workspace.is_current("models", fingerprint, workspace.sparse / "0", workspace.added):
-        num = len(read_models(workspace.sparse))
+        num = len(models_of(workspace))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True), 0
-    models = read_models(workspace.sparse)
+    models = models_of(workspace)
     matches = read_verified_matches(workspace.database)
     index = read_index(workspace)
     known_focal = {
@@ -146,14 +144,14 @@ def _write(
 
 def _judge(workspace: Workspace, model: pycolmap.Reconstruction, seed: int) -> None:
     """Write the verdict on the first model as it is now."""
-    with ItemStore(workspace.features, FEATURES).reader() as load:
+    with features_of(workspace).reader() as load:
         names, verified = read_index(workspace).names, read_verified_matches(workspace.database)
         evidence = SceneEvidence(names, verified, load, seed=seed)
         reason = "photos were added to a finished model"
         selection = judge_as_it_is(model, evidence, name=ORIGIN, reason=reason)
         record = record_of(selection, evidence)
     try:
-        before = json.loads(workspace.evidence.read_text(encoding="utf-8"))
+        before = read_json(workspace.evidence)
         record |= {"joinings": before["joinings"]}
     except (ValueError, KeyError, TypeError):
         logger.debug("%s: says nothing of models that were joined", workspace.evidence)

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
+from corrsfm.colmap import sqlite
 from corrsfm.colmap.models import read_models
-from corrsfm.colmap.sqlite import open_for_reading
-from corrsfm.errors import CorrsfmError, WorkspaceError
+from corrsfm.errors import CorrsfmError, WorkspaceError, first_few
 from corrsfm.finished.advice import command_again
-from corrsfm.types import Matches, Pair
+from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED, PrunedMatches
+from corrsfm.workspace.items import K, T
 from corrsfm.workspace.lists import read_index, read_pairs
 from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 
 __all__ = ["Damage", "find_damage"]
 
@@ -43,8 +42,7 @@ class Damage:
 def find_damage(workspace: Workspace) -> list[Damage]:
     """Read everything that the finished stages of a workspace left; nothing is changed.
 
-    Every keypoint and match is read, and no match may name a keypoint that is not there. Changed values that
-    are still possible ones are not noticed.
+    Features and matches are held against their checksums.
 
     Parameters
     ----------
@@ -61,6 +59,9 @@ def find_damage(workspace: Workspace) -> list[Damage]:
         if workspace.record_of(stage) is None:
             continue
         try:
+            # Before pycolmap meets damaged bytes, with which it may not come to an end.
+            if changed := workspace.changed_files(stage):
+                raise WorkspaceError(f"not as it was written: {first_few(map(str, changed))}")
             read()
         except CorrsfmError as error:
             problem = str(error).removeprefix(f"{path}: ")
@@ -69,17 +70,18 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             problem = f"damaged ({type(error).__name__}: {error})"
         else:
             continue
-        remedy = command_again(workspace, stage)
-        if path.exists():
-            remedy = f"{shlex.join(['rm', '-r', *map(str, _names_of(path, workspace))])}; {remedy}"
+        if stage in _STORES and path.exists():
+            remedy = command_again(workspace, stage, "--verify")
+        else:
+            remedy = command_again(workspace, stage)
+            if path.exists():
+                remedy = f"{shlex.join(['rm', '-r', str(path)])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return found
 
 
-def _names_of(path: Path, workspace: Workspace) -> list[Path]:
-    """All names of a file that is there: that of a prune method's matches would bring the damage back."""
-    others = workspace.pruned_by("*")
-    return [path, *(other for other in sorted(others.parent.glob(others.name)) if path.samefile(other))]
+# A damaged item of these is made again alone.
+_STORES = ("features", "matches", "pruned matches")
 
 
 class _Reader:
@@ -87,7 +89,6 @@ class _Reader:
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
-        self._num_keypoints: dict[str, int] = {}
 
     def stages(self) -> dict[str, tuple[Path, Callable[[], None]]]:
         """Stage → its file or folder, and what reads it."""
@@ -113,14 +114,7 @@ class _Reader:
             return ()
 
     def _features(self) -> None:
-        with ItemStore(self._workspace.features, FEATURES).reader() as read:
-            for name in self._names:
-                features = read(name)
-                if not np.isfinite(features.keypoints).all():
-                    raise WorkspaceError(f"{name}: keypoints that are not finite")
-                if len(features.descriptors) != len(features.keypoints):
-                    raise WorkspaceError(f"{name}: not as many descriptors as keypoints")
-                self._num_keypoints[name] = len(features.keypoints)
+        _whole(features_of(self._workspace), self._names)
 
     @cached_property
     def _known_pairs(self) -> tuple[Pair, ...]:
@@ -140,32 +134,23 @@ class _Reader:
             raise WorkspaceError(f"names {min(strange)}, which is no photo of the scene")
 
     def _matches(self) -> None:
-        with ItemStore(self._workspace.matches, MATCHES).reader() as read:
-            self._check_matches(read)
+        _whole(matches_of(self._workspace), self._known_pairs)
 
     def _pruned(self) -> None:
-        with ItemStore(self._workspace.pruned, PRUNED).reader() as read:
-            self._check_matches(read)
-
-    def _check_matches(self, read: Callable[[Pair], Matches] | Callable[[Pair], PrunedMatches]) -> None:
-        for pair in self._known_pairs:
-            indices = read(pair).indices
-            if indices.ndim != 2 or indices.shape[1] != 2:
-                raise WorkspaceError(f"{' – '.join(pair)}: matches of shape {indices.shape}")
-            for column, name in enumerate(pair):
-                # Where features are damaged, their number is not known.
-                num = self._num_keypoints.get(name, np.inf)
-                if not ((indices[:, column] >= 0) & (indices[:, column] < num)).all():
-                    where = " – ".join(pair)
-                    raise WorkspaceError(f"{where}: matches of keypoints that {name} does not have")
+        _whole(pruned_of(self._workspace), self._known_pairs)
 
     def _database(self) -> None:
-        with open_for_reading(self._workspace.database) as connection:
-            (result,) = connection.execute("PRAGMA integrity_check").fetchone()
-        if result != "ok":
-            raise WorkspaceError(f"damaged ({result})")
+        if problem := sqlite.find_damage(self._workspace.database):
+            raise WorkspaceError(f"damaged ({problem})")
 
     def _models(self) -> None:
+        # As they were written, see above: no need to try them first.
         for number, model in enumerate(read_models(self._workspace.sparse)):
             if not model.num_reg_images():
                 raise WorkspaceError(f"model {number} holds no photo")
+
+
+def _whole(store: ItemStore[K, T], keys: Iterable[K]) -> None:
+    store.fingerprints(keys)
+    if damaged := store.find_damage():
+        raise WorkspaceError(f"damaged: {first_few(damaged)}")

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from corrsfm import config as cfg
 from corrsfm.colmap.cameras import camera_from_pycolmap, mean_focal_px, with_focal_length
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.models import read_models
 from corrsfm.errors import InputError
 from corrsfm.features import create_extractor, reads_colour
 from corrsfm.files import atomic_write_text
@@ -41,10 +40,10 @@ from corrsfm.reconstruction.resection import (
 )
 from corrsfm.types import Camera, Features, Matches
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.imported import traits_of
 from corrsfm.workspace.lists import Index, read_index
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.models import models_of
+from corrsfm.workspace.stores import features_of
 
 __all__ = ["CSV_COLUMNS", "LocalizeResult", "LocatedPhoto", "localize"]
 
@@ -216,7 +215,7 @@ class _Locator:
     ) -> None:
         self._workspace = workspace
         self._index = read_index(workspace)
-        self._models = read_models(workspace.sparse)
+        self._models = models_of(workspace)
         self._landmarks = [Landmarks(model) for model in self._models]
         self._images = self._options("images", cfg.ImagesConfig)
         self._camera_model = camera_model or self._images.camera_model
@@ -242,7 +241,7 @@ class _Locator:
     def ready(self) -> Iterator[Callable[[Sequence[tuple[str, Path]]], list[LocatedPhoto]]]:
         """Open the features of the scene; yields what locates photos, given as names and paths."""
         use_threads(count_threads(self._run.threads))
-        with ItemStore(self._workspace.features, FEATURES).reader() as read_features:
+        with features_of(self._workspace).reader() as read_features:
             yield lambda photos: self._locate(photos, read_features)
 
     def _locate(

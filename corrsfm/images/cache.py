@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from corrsfm.files import atomic_write_json, sha256_of
+from corrsfm.files import atomic_write_json, read_json, sha256_of
 from corrsfm.images.cameras import PhotoInfo
 from corrsfm.images.photos import read_photo_info
 
@@ -33,7 +32,7 @@ class PhotoCache:
         self._path = path
         self._kept: dict[str, dict[str, Any]] = {}
         try:
-            self._known = dict(json.loads(path.read_text(encoding="utf-8")))
+            self._known = dict(read_json(path))
         except (OSError, ValueError, TypeError):
             self._known = {}
 

@@ -27,6 +27,7 @@ __all__ = ["DEFAULT_FOCAL_FACTOR", "PhotoInfo", "assign_cameras"]
 DEFAULT_FOCAL_FACTOR = 1.2
 # EXIF rounds focal lengths by a few per cent; photos of one camera that differ by more were zoomed.
 SAME_FOCAL_RATIO = 1.05
+_LARGEST_PARAMETER = 1e7
 
 logger = logging.getLogger("corrsfm")
 
@@ -188,7 +189,8 @@ def _parse_params(model: str, params: str) -> list[float]:
         values = [float(value) for value in params.split(",")]
     except ValueError:
         values = []
-    if len(values) != len(expected) or not np.isfinite(values).all():
+    # Not finite, or so large that mapping would never end.
+    if len(values) != len(expected) or not (np.abs(values) < _LARGEST_PARAMETER).all():
         raise ConfigError(
             f"camera_params is '{params}', expected the numbers {', '.join(expected)} for {model}"
         )

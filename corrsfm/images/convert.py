@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections import Counter
@@ -10,7 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 from corrsfm.errors import CorrsfmError, DependencyError, ImageError, InputError, WorkspaceError, first_few
-from corrsfm.files import OWN_RECORD, atomic_path, atomic_write_json
+from corrsfm.files import OWN_RECORD, atomic_path, atomic_write_json, read_json
 from corrsfm.images.photos import CONVERTED_SUFFIXES, convert_photo
 
 __all__ = ["is_converted", "possible_originals", "readable_copies", "readable_name"]
@@ -107,7 +106,7 @@ def _record_of(folder: Path) -> dict[str, str]:
     Names that lead out of the folder are left out: a workspace may come from anybody, and copies are removed.
     """
     try:
-        record = dict(json.loads((folder / OWN_RECORD).read_text(encoding="utf-8")))
+        record = dict(read_json(folder / OWN_RECORD))
         return {name: sha256 for name, sha256 in record.items() if _is_inside(name)}
     except FileNotFoundError:
         if folder.is_dir() and any(not path.name.startswith(".") for path in folder.iterdir()):

@@ -7,7 +7,6 @@ as the video is the same. ``frames.json`` is written last: without it the folder
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ import cv2
 import numpy as np
 
 from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import FRAME_TIMES, OWN_RECORD, atomic_path, atomic_write_json, sha256_of
+from corrsfm.files import FRAME_TIMES, OWN_RECORD, atomic_path, atomic_write_json, read_json, sha256_of
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 
 __all__ = ["Frame", "extract_frames"]
@@ -155,7 +154,7 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
         )
     key = {"version": _VERSION, "sha256": hash_of(video)}
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(path)
         if values.pop("key") == key:
             arrays = {name: np.array(values[name]) for name in ("times_s", "sharpness", "path")}
             return Measured(**(values | arrays))
@@ -188,7 +187,7 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
     }
     there = _frames_in(folder)
     try:
-        before = json.loads((folder / FRAME_TIMES).read_text(encoding="utf-8"))
+        before = read_json(folder / FRAME_TIMES)
     except (OSError, ValueError):
         before = None
     wanted = {frame.name for frame in frames}

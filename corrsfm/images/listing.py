@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -21,6 +22,9 @@ _FOREIGN_SUFFIXES = (
     ".arw", ".cr2", ".cr3", ".dng", ".gif", ".jp2", ".jxl", ".nef", ".orf", ".pef", ".raf", ".raw", ".rw2",
     ".srw",
 )  # fmt: skip
+
+# All at which lines may be split are among them.
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 
 logger = logging.getLogger("corrsfm")
 
@@ -79,11 +83,11 @@ def list_images(
         raise InputError(
             f"{folder}: names are not valid UTF-8: {first_few(map(repr, unprintable))}; rename them"
         )
-    separating = [name for name in names if "\t" in name or name.splitlines() != [name]]
+    separating = [name for name in names if _CONTROL.search(name)]
     if separating:
         raise InputError(
-            f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot:"
-            f" {first_few(map(ascii, separating))}; rename them"
+            f"{folder}: names hold a tab or a line break, which lists of photos and pairs cannot, or another"
+            f" control character: {first_few(map(ascii, separating))}; rename them"
         )
     special = [name for name in names if (folder / name).exists() and not (folder / name).is_file()]
     if special:
@@ -180,7 +184,7 @@ def _read_image_list(image_list: Path, folder: Path) -> list[str]:
     outside = [name for name in names if name.startswith("/") or ".." in PurePosixPath(name).parts]
     if outside:
         raise InputError(f"{image_list}: names must be relative to {folder}: {first_few(outside)}")
-    missing = [name for name in names if not (folder / name).is_file()]
+    missing = [name for name in names if not os.path.isfile(folder / name)]
     if missing:
         raise InputError(f"{image_list}: {len(missing)} photos are not in {folder}: {first_few(missing)}")
     return names

@@ -8,17 +8,23 @@ it; no flag is left.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
+import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.errors import DependencyError, ImageError
+from corrsfm.errors import DependencyError, ImageError, InputError
+from corrsfm.files import open_file
 from corrsfm.images.cameras import PhotoInfo
+from corrsfm.images.headers import declared_size
 
 __all__ = ["CONVERTED_SUFFIXES", "convert_photo", "read_colour", "read_image", "read_mask", "read_photo_info"]
 
@@ -27,6 +33,9 @@ CONVERTED_SUFFIXES = (".avif", ".heic", ".heif")
 
 _CONVERTED_QUALITY = 97
 _LARGEST_SEGMENT = 65533
+# Of the largest sensors there are 200 million.
+_MOST_PIXELS = 1 << 28
+_LARGEST_BYTES = (1 << 31) - 1
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -109,12 +118,11 @@ def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMRE
 
     Reads the bytes first, because OpenCV's own reader does not open names of every alphabet.
     """
-    try:
-        content = np.fromfile(path, np.uint8)
-    except OSError as error:
-        raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
-    if len(content) == 0:
-        raise ImageError(f"{path}: the file is empty; {advice}")
+    with _opened(path, advice) as file:
+        try:
+            content = np.fromfile(file, np.uint8)
+        except OSError as error:
+            raise ImageError(f"{path}: cannot be read ({error.strerror}); {advice}") from error
     if path.suffix.lower() in CONVERTED_SUFFIXES:
         colour, _ = _decode_modern(path, content.tobytes(), advice)
         return colour if kind & cv2.IMREAD_COLOR else cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)
@@ -125,6 +133,32 @@ def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMRE
     if image is None:
         raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}")
     return np.asarray(image)
+
+
+@contextlib.contextmanager
+def _opened(path: Path, advice: str) -> Iterator[BinaryIO]:
+    """A photo's file, if it is one and does not ask for more memory than any photo needs."""
+    try:
+        file = open_file(path)
+    except InputError as error:
+        raise ImageError(f"{error}; {advice}") from error
+    with file:
+        num_bytes = os.fstat(file.fileno()).st_size
+        if num_bytes == 0:
+            raise ImageError(f"{path}: the file is empty; {advice}")
+        if num_bytes > _LARGEST_BYTES:
+            raise ImageError(f"{path}: has {num_bytes / 1e6:,.0f} MB, more than any photo; {advice}")
+        if path.suffix.lower() not in CONVERTED_SUFFIXES:
+            size = declared_size(file)
+            if size is None or 0 in size:
+                raise ImageError(f"{path}: is damaged, cut off or no photo; {advice}")
+            if size[0] * size[1] > _MOST_PIXELS:
+                raise ImageError(
+                    f"{path}: {size[0]}×{size[1]} pixels are more than the {_MOST_PIXELS / 1e6:.0f} million"
+                    " that are decoded; save it smaller"
+                )
+        file.seek(0)
+        yield file
 
 
 def _decode_modern(path: Path, content: bytes, advice: str) -> tuple[NDArray[np.uint8], bytes]:
@@ -161,7 +195,9 @@ def convert_photo(path: Path, target: Path) -> None:
     ImageError, DependencyError
         As `read_image`.
     """
-    colours, exif = _decode_modern(path, path.read_bytes(), "re-export or remove the photo")
+    advice = "re-export or remove the photo"
+    with _opened(path, advice) as file:
+        colours, exif = _decode_modern(path, file.read(), advice)
     quality = [cv2.IMWRITE_JPEG_QUALITY, _CONVERTED_QUALITY]
     _, encoded = cv2.imencode(".jpg", colours, quality)
     jpeg = encoded.tobytes()
@@ -187,7 +223,8 @@ def read_photo_info(path: Path) -> PhotoInfo:
             converted = Path(folder) / "photo.jpg"
             convert_photo(path, converted)
             return read_photo_info(converted)
-    bitmap = pycolmap.Bitmap.read(path, False)
+    with _opened(path, "re-export or remove the photo"):
+        bitmap = pycolmap.Bitmap.read(path, False)
     if bitmap is None:
         # pycolmap does not know the format (WebP), or the file is unreadable.
         height, width = read_image(path).shape

@@ -113,8 +113,8 @@ def _photos_of(item: Path) -> Iterable[Path]:
 
 def _listed_in(path: Path) -> list[Path]:
     lines = [line.strip() for line in read_lines(path)]
-    photos = [path.parent / line for line in lines if line and not line.startswith("#")]
-    missing = [str(photo) for photo in photos if not photo.is_file()]
+    photos = [path.parent / line for line in dict.fromkeys(lines) if line and not line.startswith("#")]
+    missing = [str(photo) for photo in photos if not os.path.isfile(photo)]
     if missing:
         raise InputError(
             f"{path}: {len(missing)} of its photos are not there: {first_few(missing)}; expected a path a "

@@ -24,7 +24,6 @@ from corrsfm.images.listing import list_images
 from corrsfm.images.sources import Given, PhotoSource, find_source
 from corrsfm.machine import count_threads
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import check_hloc_keys
 from corrsfm.workspace.lists import Index, read_index, write_index
 from corrsfm.workspace.resume import StageOutcome, finish
 from corrsfm.workspace.warned import keeps_warnings
@@ -94,7 +93,6 @@ def index_photos(
             failed=failed,
         )
     cache.save()
-    check_hloc_keys(record.name for record in records)
     for remark in name_remarks([record.name for record in records]):
         logger.warning("%s", remark)
     for names in duplicate_images(records):

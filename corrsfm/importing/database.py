@@ -18,6 +18,7 @@ from corrsfm.types import Features, Matches, Pair
 __all__ = ["DatabaseSource", "open_database"]
 
 _SIFT_SIZE = 128
+_TABLES = {"images", "keypoints", "descriptors", "matches"}
 
 
 @contextlib.contextmanager
@@ -52,6 +53,10 @@ class DatabaseSource:
     def __init__(self, path: Path, connection: sqlite3.Connection, *, with_matches: bool) -> None:
         self._connection = connection
         self.label = str(path)
+        # A view may never end.
+        views = connection.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
+        if strange := sorted({str(name) for (name,) in views} & _TABLES):
+            raise InputError(f"{path}: {', '.join(strange)} is a view; COLMAP's databases hold tables")
         rows = connection.execute(
             "SELECT name, image_id FROM images WHERE image_id IN (SELECT image_id FROM keypoints)"
         )
@@ -128,10 +133,13 @@ class DatabaseSource:
         num_rows, num_columns, data = self._connection.execute(
             f"SELECT rows, cols, data FROM {table} WHERE {column} = ?", (key,)
         ).fetchone()
-        values = np.frombuffer(data or b"", dtype)
-        if len(values) != num_rows * num_columns:
+        if type(num_rows) is not int or type(num_columns) is not int or not isinstance(data, bytes | None):
+            raise InputError(f"{where}: {table} are {num_rows!r} × {num_columns!r}; the database is damaged")
+        data = data or b""
+        values = np.frombuffer(data[: len(data) - len(data) % dtype.itemsize], dtype)
+        if num_rows < 0 or num_columns < 0 or len(data) != num_rows * num_columns * dtype.itemsize:
             raise InputError(
-                f"{where}: {table} of {num_rows} × {num_columns} numbers are {len(data or b'')} bytes long; "
+                f"{where}: {table} of {num_rows} × {num_columns} numbers are {len(data)} bytes long; "
                 "the database is damaged"
             )
         return values.reshape(num_rows, num_columns or 2)

@@ -16,14 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import InputError, first_few
+from corrsfm.files import require_file
 from corrsfm.importing.checks import features_from, matches_from
 from corrsfm.types import Features, Matches, Pair
-from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys
+from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys, lies_elsewhere
 
 __all__ = ["HlocSource", "open_hloc"]
 
 # Of the distance between a point and its nearest neighbour on a square grid, for a grid of 1.
 MEAN_ROUNDING = 0.38
+# Of one photo or pair.
+_LARGEST_BYTES = 1 << 31
 
 
 @contextlib.contextmanager
@@ -44,6 +47,7 @@ def open_hloc(features: Path, matches: Path | None) -> Iterator[HlocSource]:
 def _open(path: Path) -> Iterator[h5py.File]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected features or matches as hloc writes them")
+    require_file(path)
     try:
         file = h5py.File(path, "r")
     except OSError as error:
@@ -76,12 +80,16 @@ class HlocSource:
         """See `corrsfm.importing.Source`."""
         group, where = self._groups[name], f"{self._features}: {name}"
         stored = self._read(where, group, "keypoints")
-        if stored.ndim == 2 and stored.dtype == np.float16 and len(stored):
+        if stored.ndim != 2:
+            raise InputError(f"{where}: keypoints have shape {stored.shape}, expected (N, 2)")
+        if stored.dtype == np.float16 and len(stored):
             spacing = np.spacing(np.abs(stored).astype(np.float16)).astype(np.float64)
             self._rounded[name] = MEAN_ROUNDING * float(np.nanmean(spacing))
         if stored.dtype.kind not in "fiu":
             raise InputError(f"{where}: keypoints are {stored.dtype}, expected numbers")
         size = self._optional(group, "image_size")
+        if size is not None and not (size.size >= 2 and np.isfinite(size.ravel()[:2]).all()):
+            raise InputError(f"{where}: image_size is {size.ravel()[:2]}, expected width and height")
         if size is not None and tuple(int(value) for value in size.ravel()[:2]) != image_size:
             raise InputError(
                 f"{where}: features of a photo of {int(size.ravel()[0])} × {int(size.ravel()[1])} pixels, "
@@ -174,11 +182,22 @@ class HlocSource:
         return found
 
     def _read(self, where: str, group: h5py.Group, key: str) -> NDArray[Any]:
-        if not isinstance(group.get(key), h5py.Dataset):
-            raise InputError(f"{where}: has no '{key}', only {', '.join(sorted(group))}")
         try:
-            return np.asarray(group[key][()])
-        except OSError as error:
+            item = group.get(key)
+            if not isinstance(item, h5py.Dataset):
+                raise InputError(f"{where}: has no '{key}', only {', '.join(sorted(group))}")
+            if lies_elsewhere(item, group.file):
+                raise InputError(
+                    f"{where}: the values of '{key}' lie in another file; copy them into this one"
+                )
+            if item.shape is None or item.dtype.kind not in "biuf":
+                raise InputError(f"{where}: '{key}' is {item.dtype}, expected real numbers")
+            if item.nbytes > _LARGEST_BYTES:
+                raise InputError(
+                    f"{where}: '{key}' declares {item.nbytes / 1e9:,.0f} GB; write the file again"
+                )
+            return np.asarray(item[()])
+        except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
             raise InputError(f"{where}: '{key}' cannot be read ({error}); write the file again") from error
 
     def _optional(self, group: h5py.Group, key: str) -> NDArray[Any] | None:
@@ -202,5 +221,8 @@ def _groups_with(file: h5py.File, key: str) -> dict[str, h5py.Group]:
         if isinstance(item, h5py.Group) and key in item:
             found[name] = item
 
-    file.visititems(visit)
+    try:
+        file.visititems(visit)
+    except (OSError, RuntimeError, LookupError) as error:
+        raise InputError(f"{file.filename}: is damaged ({error}); write the file again") from error
     return found

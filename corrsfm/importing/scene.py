@@ -22,15 +22,14 @@ from corrsfm.importing.database import open_database
 from corrsfm.importing.hloc import open_hloc
 from corrsfm.types import Features, ImageRecord, Matches, Pair, PairList
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, Arrays
 from corrsfm.workspace.imported import (
     fingerprint_of_imported,
     record_imported_pairs,
-    refuse_foreign_files,
 )
+from corrsfm.workspace.items import FEATURES, MATCHES, Arrays
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import complete
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of
 
 __all__ = ["ImportResult", "import_features"]
 
@@ -156,7 +155,6 @@ def _import(
     images: cfg.ImagesConfig,
     overwrite: bool,
 ) -> ImportResult:
-    refuse_foreign_files(folder)
     workspace = Workspace(folder, create=True, images_dir=photos)
     with workspace.lock():
         if workspace.features.exists() and not overwrite:
@@ -218,7 +216,7 @@ def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, inde
     for stage in ("pairs", "matches"):
         workspace.forget(stage)
     complete(
-        workspace, "features", ItemStore(workspace.features, FEATURES), wanted,
+        workspace, "features", features_of(workspace), wanted,
         lambda missing: ((name, read(name)) for name in missing), config,
         inputs={"images": workspace.require("images").fingerprint}, overwrite=True, unit="photo",
     )  # fmt: skip
@@ -227,7 +225,7 @@ def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, inde
         record_imported_pairs(workspace, PairList(pairs=tuple(pairs), origins=origins), config)
         inputs = {stage: workspace.require(stage).fingerprint for stage in ("features", "pairs")}
         complete(
-            workspace, "matches", ItemStore(workspace.matches, MATCHES), wanted_pairs,
+            workspace, "matches", matches_of(workspace), wanted_pairs,
             lambda missing: ((pair, read_pair(pair)) for pair in missing), config,
             inputs=inputs, overwrite=True, unit="pair",
         )  # fmt: skip

@@ -779,7 +779,7 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         problems = []
-        if self.channels < 4 or self.channels % 4 or self.channels % self.heads:
+        if self.channels < 4 or self.channels % 4 or self.heads < 1 or self.channels % self.heads:
             problems.append(
                 f"channels is {self.channels}, expected a multiple of 4 and of heads ({self.heads})"
             )
@@ -791,6 +791,8 @@ class NetworkConfig:
             problems.append(f"pruning_ratio is {self.pruning_ratio}, expected more than 0 and at most 1")
         for name, smallest in [
             ("clusters", 1),
+            ("mlp_ratio", 1),
+            ("oa_filters", 0),
             ("fusion_rounds", 1),
             ("motion_stacking", 0),
             ("side_channels", 0),

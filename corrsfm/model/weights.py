@@ -21,7 +21,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, overload
+from types import UnionType
+from typing import Any, Literal, Union, get_origin, get_type_hints, overload
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +61,9 @@ CORRADAPTOR = "corradaptor"
 
 # Networks share names with their ancestors; a file with fewer in common than this is of none of them.
 SMALLEST_OVERLAP = 0.5
+
+# Of any number in a configuration: a hostile one may ask for a network larger than all memory.
+_LARGEST_OPTION = 4096
 
 CHECKPOINT_DIR = Path(__file__).parent / "checkpoints"
 
@@ -259,7 +263,12 @@ def save_network(
 def read_provenance(path: Path | str | None = None) -> dict[str, Any]:
     """Where the weights of a corrsfm checkpoint come from; empty for one in the published format."""
     file, released_sha256 = _locate(path)
-    return dict(_read(file, "cpu", expected_sha256=released_sha256).get("provenance", {}))
+    provenance = _read(file, "cpu", expected_sha256=released_sha256).get("provenance", {})
+    if not isinstance(provenance, dict):
+        raise CheckpointError(
+            f"{file}: its provenance is a {type(provenance).__name__}, expected a dictionary"
+        )
+    return provenance
 
 
 def checkpoint_sha256(path: Path | str | None = None) -> str:
@@ -341,10 +350,27 @@ def _read_config(values: Any, file: Path) -> NetworkConfig | RivalConfig:
             f"{file}: unknown network options {', '.join(unknown)}; valid are {', '.join(known)}"
         )
     values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    kinds = get_type_hints(described)
+    if strange := [name for name, value in values.items() if not _is_plausible(value, kinds[name])]:
+        described_values = ", ".join(f"{name} is {str(values[name])[:40]}" for name in strange)
+        raise CheckpointError(f"{file}: impossible network options: {described_values}")
     try:
         return described(**values)
     except (ConfigError, TypeError) as error:
         raise CheckpointError(f"{file}: {error}") from error
+
+
+def _is_plausible(value: Any, kind: Any) -> bool:
+    """Whether an option has the type of its field, and a size of which a network can be built."""
+    if get_origin(kind) is tuple:
+        return isinstance(value, tuple) and all(_is_plausible(item, int) for item in value)
+    if get_origin(kind) in (Union, UnionType):
+        return value is None or _is_plausible(value, int)
+    if kind is int:
+        return type(value) is int and abs(value) <= _LARGEST_OPTION
+    if kind is float:
+        return type(value) in (int, float)
+    return isinstance(value, bool if kind is bool else str)
 
 
 def _read_usage(values: Any, file: Path) -> NetworkUsage:

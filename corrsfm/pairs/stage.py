@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from pathlib import Path
 
@@ -14,11 +15,10 @@ from corrsfm.graph import describe_components
 from corrsfm.pairs import strategies
 from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.imported import imported_from, record_imported_pairs
 from corrsfm.workspace.lists import Index, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["fingerprint_of", "make_pairs"]
@@ -55,7 +55,7 @@ def make_pairs(
         _warn_if_disconnected(names, pair_list)
         return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
     explain(workspace, "pairs", config)
-    with ItemStore(workspace.features, FEATURES).reader() as read:
+    with features_of(workspace).reader() as read:
         # A list or a model may name photos that were left out.
         candidates = index.records if config.pairs_file or config.covisible_model else records
         pair_list = _without(
@@ -112,5 +112,5 @@ def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
 
 def _content(path: Path) -> str:
     """Hash of what a file or all files of a folder hold; what reads them reports missing ones."""
-    files = sorted(path.iterdir()) if path.is_dir() else [path] if path.exists() else []
+    files = sorted(path.iterdir()) if os.path.isdir(path) else [path] if os.path.exists(path) else []
     return config_hash(*[[file.name, sha256_of(file)] for file in files if file.is_file()])

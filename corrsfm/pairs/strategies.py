@@ -340,7 +340,10 @@ def read_pairs_file(path: Path, names: Sequence[str]) -> IndexPairs:
 
 
 def _parse_pair(line: str, position: dict[str, int]) -> tuple[int, int] | None:
-    candidates: list[Sequence[str]] = [[part.strip() for part in line.split("\t")], line.split()]
+    words = line.split()
+    if len(words) == 2 and words[0] != words[1] and words[0] in position and words[1] in position:
+        return _ordered(position[words[0]], position[words[1]])
+    candidates: list[Sequence[str]] = [[part.strip() for part in line.split("\t")]]
     if '"' in line or "'" in line:
         with contextlib.suppress(ValueError):  # an apostrophe in a name is not a quote
             candidates.append(shlex.split(line))
@@ -370,12 +373,9 @@ def covisible_pairs(model: Path, names: Sequence[str], num_covisible: int) -> In
     InputError
         If the model cannot be read, has none of the photos, or no two of them share a point.
     """
-    import pycolmap
+    from corrsfm.colmap.models import read_model
 
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{model}: cannot be read as a COLMAP model folder ({error})") from error
+    reconstruction = read_model(model)
     position = {name: index for index, name in enumerate(names)}
     observed = {
         position[image.name]: [point.point3D_id for point in image.points2D if point.has_point3D()]

@@ -6,7 +6,6 @@ of its description alone: so processes, not threads, and the results do not depe
 
 from __future__ import annotations
 
-import json
 import logging
 import multiprocessing
 from collections.abc import Sequence
@@ -16,6 +15,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from corrsfm.files import read_json
+from corrsfm.machine import end_with_parent
 from corrsfm.reconstruction.candidates import Candidate, map_candidate
 
 if TYPE_CHECKING:
@@ -59,7 +60,11 @@ class CandidatePool:
         }
         # A fork would copy pycolmap's threads in whatever state they are.
         self._executor = (
-            ProcessPoolExecutor(num_processes, mp_context=multiprocessing.get_context("spawn"))
+            ProcessPoolExecutor(
+                num_processes,
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_end_with_parent,
+            )
             if num_processes > 1
             else None
         )
@@ -104,11 +109,18 @@ class CandidatePool:
 
     def seconds(self, candidate: Candidate) -> float:
         """Seconds that a mapped candidate took, when it was mapped."""
-        values = json.loads((self._folder(candidate) / "candidate.json").read_text(encoding="utf-8"))
+        values = read_json(self._folder(candidate) / "candidate.json")
         return float(values["seconds"])
 
     def _folder(self, candidate: Candidate) -> Path:
         return self._workdir / candidate.name
+
+
+def _end_with_parent() -> None:
+    """Leave no process that writes on when the run was killed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_with_parent(parent.sentinel)
 
 
 def _map_in_process(job: tuple[Candidate, Path, Path, dict[str, object]]) -> None:

@@ -30,10 +30,9 @@ from corrsfm.reconstruction.mapper import threads_for
 from corrsfm.reconstruction.record import record_of
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_added, read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def reconstruct(
     _warn_of_parts(workspace, names)
     workspace.evidence.unlink(missing_ok=True)
     chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
-    features = ItemStore(workspace.features, FEATURES)
+    features = features_of(workspace)
     with (
         features.reader() if chooses or config.join_models else nullcontext(_no_features) as load,
         tqdm(total=len(names), desc="mapping", unit="photo", leave=False) as bar,

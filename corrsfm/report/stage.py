@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
+from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.colmap.models import read_models, summarise_model
+from corrsfm.colmap.models import summarise_model
 from corrsfm.colmap.pairs import read_verified_matches, read_verified_pairs
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_write_json, read_json
 from corrsfm.machine import versions
 from corrsfm.report.page import write_html
 from corrsfm.report.statistics import SceneReport, StageWarning, make_report
-from corrsfm.types import Pair, PairStatistics
+from corrsfm.types import Pair, PairStatistics, check_indices
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
 from corrsfm.workspace.lists import read_added, read_index, read_pairs
+from corrsfm.workspace.models import models_of
 from corrsfm.workspace.resume import photos_left_out, require_database
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, read_warnings
 
 if TYPE_CHECKING:
@@ -70,7 +70,13 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
     if "models" in records and not workspace.current_record_of("models"):
         del records["models"]
         logger.warning("models are older than the matches; run: %s", workspace.command_for("models"))
-    models = read_models(workspace.sparse) if "models" in records else []
+    changed = {path for stage in records for path in workspace.changed_files(stage)}
+    for path in sorted(changed):
+        if not path.is_relative_to(workspace.sparse):
+            logger.warning(
+                "%s: not as it was written; corrsfm check %s says how it is made again", path, workspace.root
+            )
+    models = models_of(workspace, changed) if "models" in records else []
     names = read_index(workspace).names
     summary = make_report(
         scene=workspace.root.resolve().name,
@@ -82,17 +88,27 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
         stage_seconds={stage: record.seconds for stage, record in records.items()},
         configuration={stage: record.config for stage, record in records.items()},
         versions=versions(),
-        evidence=_read_record(workspace.evidence) if "models" in records else {},
-        camera_remarks=_read_record(workspace.cameras_json).get("remarks", []),
+        evidence=_read_record(workspace.evidence, changed) if "models" in records else {},
+        camera_remarks=_read_record(workspace.cameras_json, changed).get("remarks", []),
         added=[name for name, found in read_added(workspace).items() if found["model"] is not None],
     )
     return summary, models
 
 
-def _read_record(path: Path) -> dict[str, Any]:
+# What other code takes for granted of records.
+_KINDS: dict[str, type] = {"remarks": list, "verdict": dict, "pairs": list, "joinings": list}
+
+
+def _read_record(path: Path, changed: Collection[Path]) -> dict[str, Any]:
     """A record that a stage left for the report; empty if an older version left none or it is damaged."""
+    if path in changed:
+        return {}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8")))
+        values = dict(read_json(path))
+        for key, kind in _KINDS.items():
+            if not isinstance(values.get(key, kind()), kind):
+                raise ValueError(f"{key} is no {kind.__name__}")
+        return values
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, TypeError) as error:
@@ -104,7 +120,7 @@ def _pair_statistics(workspace: Workspace) -> list[PairStatistics]:
     verified = {
         (pair.name0, pair.name1): pair.num_inliers for pair in read_verified_pairs(workspace.database)
     }
-    pruned = ItemStore(workspace.pruned, PRUNED)
+    pruned = pruned_of(workspace)
     return [
         PairStatistics(
             name0=name0,
@@ -122,8 +138,9 @@ def _points_of_matches(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
     """Putative matches of a pair as points in both photos, and which of them pruning kept."""
     keypoints0, keypoints1 = _keypoints(workspace, pair)
-    indices = ItemStore(workspace.matches, MATCHES).read(pair).indices
-    kept = ItemStore(workspace.pruned, PRUNED).read(pair).indices
+    indices = matches_of(workspace).read(pair).indices
+    check_indices(pair, indices, (len(keypoints0), len(keypoints1)))
+    kept = pruned_of(workspace).read(pair).indices
     return keypoints0[indices[:, 0]], keypoints1[indices[:, 1]], np.isin(indices[:, 0], kept[:, 0])
 
 
@@ -136,5 +153,5 @@ def _points_of_verified(workspace: Workspace, pair: Pair) -> tuple[NDArray[np.fl
 
 
 def _keypoints(workspace: Workspace, pair: Pair) -> list[NDArray[np.float32]]:
-    with ItemStore(workspace.features, FEATURES).reader() as read_features:
+    with features_of(workspace).reader() as read_features:
         return [read_features(name).keypoints for name in pair]

@@ -70,7 +70,7 @@ def test_steps_share_seed_device_threads_overwrite_and_json(name: str) -> None:
 
 
 def test_extract_leaves_what_it_promises(scene: Path) -> None:
-    for name in ("images.txt", "features.h5", "pairs.txt", "matches.h5"):
+    for name in ("images.txt", "features.db", "pairs.txt", "matches.db"):
         assert (scene / name).exists(), name
     assert (scene / "images.txt").read_text().split() == ["0.png", "1.png", "2.png", "3.png"]
     assert (scene / "pairs.txt").read_text().splitlines()[0] == "0.png 1.png"
@@ -92,7 +92,7 @@ def test_steps_print_json_on_stdout_and_nothing_else(scene: Path, photos: Path) 
 def test_prune_writes_the_database(scene: Path) -> None:
     result = invoke("-q", "prune", scene, "--method", "ratio")
     assert result.exit_code == 0, result.output
-    assert (scene / "pruned.h5").exists() and (scene / "database.db").exists()
+    assert list((scene / "pruned").iterdir()) and (scene / "database.db").exists()
 
 
 def test_underscores_in_flags_are_accepted(scene: Path) -> None:

@@ -125,3 +125,14 @@ def test_values_nested_without_end_are_an_error(tmp_path: Path) -> None:
     (tmp_path / "deep.toml").write_text("a=" + 100_000 * "[")
     with pytest.raises(ConfigError, match=r"deep\.toml: its values are nested too deep"):
         cfg.load_pipeline(tmp_path / "deep.toml")
+
+
+def test_files_of_a_config_get_absolute_paths_and_names_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.pt").touch()
+    config = cfg.PruneConfig(model=Path("mine.pt"), max_candidates=7)
+    assert cfg.absolute(config) == dataclasses.replace(config, model=tmp_path / "mine.pt")
+    bundled = cfg.PruneConfig(model=Path("small-mutual"))
+    assert cfg.absolute(bundled) == bundled

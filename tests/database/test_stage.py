@@ -13,7 +13,7 @@ from corrsfm.database import stage
 from corrsfm.database.focal_votes import FocalVotes, VoteDecision
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import StageRecord, Workspace
-from corrsfm.workspace.hloc import PrunedMatches
+from corrsfm.workspace.items import PrunedMatches
 from corrsfm.workspace.lists import Index
 
 NAMES = ("0.jpg", "1.jpg", "2.jpg")

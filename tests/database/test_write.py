@@ -9,6 +9,16 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from database_scene import (
+    CAMERA,
+    NAMES,
+    NUM_POINTS,
+    all_matches,
+    images,
+    kept_pairs,
+    scene_features,
+    write,
+)
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.pairs import read_verified_pairs
@@ -19,77 +29,7 @@ from corrsfm.database.write import write_database
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.types import Camera, Features, ImageRecord, VerifiedPair
 
-CAMERA = Camera(
-    model="SIMPLE_RADIAL",
-    width=640,
-    height=480,
-    params=(600.0, 320.0, 240.0, 0.01),
-    has_prior_focal_length=True,
-)
-NAMES = ("a b/größe.jpg", "a/1.jpg", "b.jpg")
-NUM_POINTS = 60
-
-
-def scene_features(seed: int = 0) -> dict[str, Features]:
-    """The same 60 points in space seen by three cameras along a line; keypoint i is point i everywhere."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform([-2, -1.5, 4], [2, 1.5, 8], (NUM_POINTS, 3))
-    camera = pycolmap.Camera(model=CAMERA.model, width=640, height=480, params=list(CAMERA.params))
-    features = {}
-    for position, name in enumerate(NAMES):
-        keypoints = camera.img_from_cam(points - [0.5 * position, 0, 0]).astype(np.float32)
-        features[name] = Features(
-            keypoints=keypoints,
-            scales=np.full(NUM_POINTS, 2.0, np.float32),
-            orientations=np.zeros(NUM_POINTS, np.float32),
-            scores=np.ones(NUM_POINTS, np.float32),
-            descriptors=rng.integers(0, 255, (NUM_POINTS, 128), dtype=np.uint8),
-            image_size=(640, 480),
-        )
-    return features
-
-
-def big_features() -> dict[str, Features]:
-    """Features whose keypoints take half a megabyte an image."""
-    return {
-        name: Features(
-            keypoints=np.tile(features.keypoints, (500, 1)),
-            scales=np.ones(30_000, np.float32),
-            orientations=np.zeros(30_000, np.float32),
-            scores=np.ones(30_000, np.float32),
-            descriptors=np.zeros((30_000, 128), np.uint8),
-            image_size=(640, 480),
-        )
-        for name, features in scene_features().items()
-    }
-
-
-def images(names: tuple[str, ...] = NAMES) -> list[ImageRecord]:
-    return [ImageRecord(name=name, camera_id=0, sha256="") for name in names]
-
-
-def all_matches() -> np.ndarray:
-    return np.column_stack([np.arange(NUM_POINTS)] * 2).astype(np.int32)
-
-
-def kept_pairs() -> list[tuple[str, str, np.ndarray]]:
-    return [
-        (NAMES[0], NAMES[1], all_matches()),
-        (NAMES[2], NAMES[1], all_matches()[:20]),
-        (NAMES[0], NAMES[2], np.zeros((0, 2), np.int32)),
-    ]
-
-
-def write(path: Path, kept=None, **arguments) -> None:
-    features = scene_features()
-    arguments = {
-        "images": images(),
-        "cameras": [CAMERA],
-        "features": features.__getitem__,
-        "kept": kept_pairs() if kept is None else kept,
-        "config": DatabaseConfig(),
-    } | arguments
-    write_database(path, **arguments)
+SUPPORT = Path(__file__).resolve().parents[1] / "support"
 
 
 def counts(path: Path) -> dict[str, int]:
@@ -282,8 +222,8 @@ def test_failure_midway_leaves_nothing(tmp_path: Path) -> None:
 def test_killed_run_leaves_no_database_and_the_next_run_succeeds(tmp_path: Path) -> None:
     code = f"""
 import os, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
-import test_write as t
+sys.path.insert(0, {str(SUPPORT)!r})
+import database_scene as t
 from pathlib import Path
 def killed():
     yield t.kept_pairs()[0]
@@ -349,7 +289,8 @@ def test_database_open_in_another_process_is_not_replaced(tmp_path: Path, hold) 
 FULL_DISK = """
 import resource, sys
 sys.path.insert(0, sys.argv[1])
-import test_write as t
+import database_scene as t
+from corrsfm.errors import DatabaseError
 from pathlib import Path
 path = Path(sys.argv[2])
 # A limit on the size of files fails like a disk that fills up.
@@ -357,7 +298,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (250_000, 250_000))
 try:
     features = t.big_features().__getitem__
     t.write(path, features=features)
-except t.DatabaseError as error:
+except DatabaseError as error:
     print(error)
 """
 
@@ -366,7 +307,7 @@ def test_disk_that_fills_up_is_said_and_leaves_the_old_database(tmp_path: Path) 
     path = tmp_path / "database.db"
     write(path)
     before = path.read_bytes()
-    arguments = [sys.executable, "-c", FULL_DISK, str(Path(__file__).parent), str(path)]
+    arguments = [sys.executable, "-c", FULL_DISK, str(SUPPORT), str(path)]
     output = subprocess.run(arguments, check=True, capture_output=True, text=True).stdout
     assert output == f"{path}: the disk is full or failing; free some space and run the same command again\n"
     assert path.read_bytes() == before

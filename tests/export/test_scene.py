@@ -73,9 +73,9 @@ def test_an_empty_folder_is_filled(scene: FinishedScene, tmp_path: Path) -> None
 
 
 def test_a_workspace_without_models_names_the_command(tmp_path: Path, copied: FinishedScene) -> None:
-    manifest = copied.workspace / "workspace.json"
-    values = json.loads(manifest.read_text())
-    manifest.write_text(json.dumps({**values, "stages": {}}))
+    workspace = Workspace(copied.workspace)
+    for stage in ("images", "features", "pairs", "matches", "pruned matches", "verified matches", "models"):
+        workspace.forget(stage)
     with pytest.raises(WorkspaceError, match="no models yet; run: corrsfm reconstruct"):
         export_scene(copied.workspace, tmp_path / "out", "csv")
 

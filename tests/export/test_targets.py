@@ -1,6 +1,7 @@
 """Every export comes back through its tool's reading rules: the same poses, points and projections."""
 
 import csv
+import resource
 from pathlib import Path
 
 import cv2
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 
 from corrsfm import export_scene
 from corrsfm.colmap.models import poses_of
+from corrsfm.errors import CorrsfmError
 from corrsfm.export.tables import CSV_COLUMNS
 
 POSE_TOLERANCE = 1e-6
@@ -291,6 +293,17 @@ def test_ply_has_the_points_and_their_colours(scene: FinishedScene, tmp_path: Pa
     }
     found = zip(positions, colours, strict=True)
     assert {tuple(position): tuple(colour) for position, colour in found} == expected
+
+
+def test_points_that_do_not_fit_on_the_disk_are_said(scene: FinishedScene, tmp_path: Path) -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, before[1]))
+    try:
+        with pytest.raises(CorrsfmError, match="points.ply: cannot be written"):
+            export_scene(scene.workspace, tmp_path / "points.ply", "ply")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.glob("*points.ply*"))
 
 
 def test_csv_has_a_line_a_photo(scene: FinishedScene, tmp_path: Path) -> None:

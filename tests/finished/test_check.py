@@ -130,6 +130,7 @@ def test_a_wrong_model_comes_first_and_ends_with_a_code(scene: FinishedScene) ->
     }  # fmt: skip
     evidence = scene.workspace / "evidence.json"
     evidence.write_text(json.dumps({"verdict": verdict}))
+    Workspace(scene.workspace).finish("models", StageRecord(fingerprint="made up"))
     result = check_workspace(scene.workspace)
     assert result.findings[0].kind == "verdict" and not result.is_usable
     assert shlex.split(result.findings[0].next_step)[-2:] == ["--max-models-tried", "48"]

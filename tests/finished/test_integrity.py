@@ -1,13 +1,13 @@
 """Damaged files are named, and the command that is named makes them again."""
 
+import contextlib
 import json
 import shlex
 import shutil
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
 from click.testing import CliRunner
 from rendered_scene import CONFIG
@@ -33,40 +33,46 @@ def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def drop_a_line(path: Path) -> None:
+    path.write_text("".join(path.read_text("utf-8").splitlines(keepends=True)[:-1]), "utf-8")
+
+
+def change_a_digit(path: Path) -> None:
+    text = path.read_text("utf-8")
+    place = next(number for number, letter in enumerate(text) if letter.isdigit())
+    path.write_text(text[:place] + str((int(text[place]) + 1) % 10) + text[place + 1 :], "utf-8")
+
+
 def cut_model(path: Path) -> None:
     cut(path / "0" / "images.bin")
 
 
-def lose_keypoints(path: Path) -> None:
-    with h5py.File(path, "r+") as file:
-        group = file[sorted(file)[0]]
-        kept = group["keypoints"][:5]
-        del group["keypoints"]
-        group["keypoints"] = kept
+def change_a_value(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as store, store:
+        number, data = store.execute("SELECT number, data FROM arrays LIMIT 1").fetchone()
+        changed = data[:40] + bytes([data[40] ^ 1]) + data[41:]
+        store.execute("UPDATE arrays SET data = ? WHERE number = ?", (changed, number))
 
 
-def name_too_many(path: Path) -> None:
-    def change(name: str, item: h5py.Dataset) -> None:
-        if name.endswith("/matches0"):
-            values = item[()]
-            values[values >= 0] = np.iinfo(values.dtype).max
-            item[...] = values
-
-    with h5py.File(path, "r+") as file:
-        file.visititems(change)
+def lose_an_item(path: Path) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as store, store:
+        store.execute("DELETE FROM items WHERE number = 1")
 
 
 @pytest.mark.parametrize(
     ("attribute", "damage", "stage"),
     [
         ("images_json", cut, "images"),
+        ("images_json", change_a_digit, "images"),
+        ("pair_origins", drop_a_line, "pairs"),
         ("features", cut, "features"),
-        ("features", lose_keypoints, "features"),
+        ("features", change_a_value, "features"),
+        ("features", lose_an_item, "features"),
         ("pairs", Path.unlink, "pairs"),
         ("matches", cut, "matches"),
         ("matches", Path.unlink, "matches"),
         ("pruned", cut, "pruned matches"),
-        ("pruned", name_too_many, "pruned matches"),
+        ("pruned", change_a_value, "pruned matches"),
         ("database", cut, "verified matches"),
         ("sparse", cut_model, "models"),
         ("sparse", shutil.rmtree, "models"),

@@ -23,9 +23,8 @@ from corrsfm.files import OWN_RECORD
 from corrsfm.images.convert import possible_originals, readable_copies, readable_name
 from corrsfm.images.photos import convert_photo, read_colour, read_image, read_photo_info
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import Index, read_index, write_index
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 FEW = cfg.FeaturesConfig(max_features=200)
@@ -197,7 +196,7 @@ def test_masks_are_named_like_the_photos_and_not_like_their_copies(mixed: Path, 
     pipeline.index_photos(workspace, mixed, cfg.ImagesConfig(mask_dir=tmp_path / "masks"), RUN)
     pipeline.extract_features(workspace, FEW, RUN)
     assert read_index(workspace).records[0].mask == "a.avif.png"
-    with ItemStore(workspace.features, FEATURES).reader() as read:
+    with features_of(workspace).reader() as read:
         assert read("a.jpg").keypoints[:, 0].min() > 155
         assert read("c.jpg").keypoints[:, 0].min() < 100
 
@@ -300,7 +299,7 @@ def test_a_turned_photo_has_one_frame_from_detection_to_export(tmp_path: Path) -
     pipeline.extract_features(workspace, FEW, RUN)
     index = read_index(workspace)
     assert [(camera.width, camera.height) for camera in index.cameras] == [(320, 240)]
-    with ItemStore(workspace.features, FEATURES).reader() as read:
+    with features_of(workspace).reader() as read:
         keypoints = read("1.jpg").keypoints
     assert keypoints[:, 0].min() > 195 and keypoints[:, 0].max() > 300 and keypoints[:, 1].max() < 240
     # COLMAP's own reader gives the photo the same pixels, whatever the flag.

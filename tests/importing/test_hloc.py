@@ -246,10 +246,10 @@ def test_pairs_of_other_photos_twice_or_of_one_photo_are_refused(
 
 def test_a_workspace_with_features_keeps_them(photos: Path, features: Path, tmp_path: Path) -> None:
     import_features(photos, tmp_path / "scene", features=features)
-    before = (tmp_path / "scene" / "features.h5").read_bytes()
+    before = (tmp_path / "scene" / "features.db").read_bytes()
     with pytest.raises(WorkspaceError, match="is there already; choose another folder, or add --overwrite"):
         import_features(photos, tmp_path / "scene", features=features)
-    assert (tmp_path / "scene" / "features.h5").read_bytes() == before
+    assert (tmp_path / "scene" / "features.db").read_bytes() == before
     import_features(photos, tmp_path / "scene", features=features, overwrite=True)
 
 
@@ -262,34 +262,20 @@ def test_one_source_must_be_given(photos: Path, features: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["features.h5", "matches.h5"])
-def test_a_file_of_another_tool_is_never_overwritten(
+def test_files_of_hloc_in_the_folder_of_a_workspace_stay_as_they_are(
     photos: Path, names: list[str], tmp_path: Path, name: str
 ) -> None:
     folder = tmp_path / "hloc"
     folder.mkdir()
-    if name == "features.h5":
-        write_features(folder / name, names)
-        holds = "keypoints of 3 photos, descriptors of 64 numbers"
-    else:
-        write_matches(folder / name, [(names[0], names[1])])
-        holds = "matches of 1 pairs"
+    write_features(folder / name, names)
     before = (folder / name).read_bytes()
-    with pytest.raises(
-        WorkspaceError, match=f"{name}: another tool wrote it .{holds}.*corrsfm import PHOTOS"
-    ):
-        pipeline.run_scene(photos, folder, cfg.PipelineConfig(run=RUN))
-    assert [path.name for path in folder.iterdir()] == [name]
+    pipeline.run_scene(photos, folder, cfg.PipelineConfig(run=RUN))
+    manifest = folder / "workspace.json"
+    old = manifest.read_text("utf-8").replace('"format_version": 2', '"format_version": 1')
+    manifest.write_text(old, "utf-8")
+    with Workspace(folder).lock():
+        pass
     assert (folder / name).read_bytes() == before
-
-
-def test_a_foreign_file_put_into_a_workspace_is_not_overwritten(
-    photos: Path, names: list[str], tmp_path: Path
-) -> None:
-    workspace = Workspace(tmp_path / "scene", create=True)
-    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), RUN)
-    write_features(workspace.features, names)
-    with pytest.raises(WorkspaceError, match="another tool wrote it"):
-        pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN, overwrite=True)
 
 
 def test_lightglue_is_not_asked_for_features_that_it_does_not_know(

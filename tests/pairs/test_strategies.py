@@ -273,7 +273,7 @@ def test_covisible_pairs_are_those_that_share_most_points(tmp_path: Path) -> Non
 
 
 def test_models_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="none: cannot be read as a COLMAP model"):
+    with pytest.raises(InputError, match="none: COLMAP model cannot be read"):
         covisible_pairs(tmp_path / "none", NAMES, 5)
     model = write_model(tmp_path / "model", 3)
     with pytest.raises(InputError, match="none of its images is among the photos"):

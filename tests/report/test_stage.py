@@ -70,11 +70,10 @@ def test_models_of_earlier_matches_are_not_mixed_with_new_ones(
 
 
 def test_counts_of_a_pair_are_those_of_its_matches(workspace: Workspace) -> None:
-    from corrsfm.workspace.hloc import MATCHES, PRUNED
     from corrsfm.workspace.lists import read_pairs
-    from corrsfm.workspace.store import ItemStore
+    from corrsfm.workspace.stores import matches_of, pruned_of
 
-    matches, pruned = ItemStore(workspace.matches, MATCHES), ItemStore(workspace.pruned, PRUNED)
+    matches, pruned = matches_of(workspace), pruned_of(workspace)
     pairs = pipeline.report(workspace).pairs
     assert [(pair.name0, pair.name1) for pair in pairs] == sorted(read_pairs(workspace).pairs)
     for pair in pairs:

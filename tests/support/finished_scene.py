@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.types import Features, ImageRecord, PairList
 from corrsfm.workspace import StageRecord, Workspace
-from corrsfm.workspace.hloc import FEATURES, PRUNED, PrunedMatches
+from corrsfm.workspace.items import PrunedMatches
 from corrsfm.workspace.lists import Index, write_index, write_pairs
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, pruned_of
 
 WIDTH, HEIGHT = 200, 150
 CAMERAS = {
@@ -125,11 +125,11 @@ def _write_lists(workspace: Workspace, model: pycolmap.Reconstruction, photos: P
     names = [image.name for image in images]
     pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
     write_pairs(workspace, PairList(pairs=tuple(pairs), origins=(("exhaustive",),) * len(pairs)))
-    features = ItemStore(workspace.features, FEATURES)
+    features = features_of(workspace)
     for image in images:
         features.add(image.name, "0", _features_of(image))
-    features.commit(dict.fromkeys(names, "0"))
-    pruned = ItemStore(workspace.pruned, PRUNED)
+    features.commit(dict.fromkeys(names, "0"), "features")
+    pruned = pruned_of(workspace)
     for pair in pairs:
         index0, index1 = (_keypoint_of_point(model.find_image_with_name(name)) for name in pair)
         common = index0.keys() & index1.keys()
@@ -139,7 +139,7 @@ def _write_lists(workspace: Workspace, model: pycolmap.Reconstruction, photos: P
                 indices=matches, scores=np.full(len(matches), 0.75, np.float32), num_putative=len(matches)
             ),
         )  # fmt: skip
-    pruned.commit(dict.fromkeys(pairs, "0"))
+    pruned.commit(dict.fromkeys(pairs, "0"), "pruned matches")
 
 
 def _keypoint_of_point(image: pycolmap.Image) -> dict[int, int]:

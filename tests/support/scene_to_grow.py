@@ -10,9 +10,7 @@ from pathlib import Path
 import pycolmap
 from rendered_scene import CONFIG, render_scene
 
-from corrsfm.files import share_file
 from corrsfm.pipeline import run_scene
-from corrsfm.workspace import Workspace
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,9 +31,6 @@ class SceneToGrow:
         manifest = moved.workspace / "workspace.json"
         text = manifest.read_text(encoding="utf-8")
         manifest.write_text(text.replace(str(self.photos.resolve()), str(moved.photos.resolve())), "utf-8")
-        # Copying made two files of one.
-        workspace = Workspace(moved.workspace)
-        share_file(workspace.pruned_by(CONFIG.prune.method), workspace.pruned)
         return moved
 
     @property

@@ -102,7 +102,7 @@ def test_a_command_measures_all_methods_of_its_file_and_is_folded_before_flags(r
 
 
 def test_table_without_a_file_behind_it_does_not_exist(results_dir: Path) -> None:
-    with pytest.raises(InputError, match=r"made_up\.json: not a result file"):
+    with pytest.raises(InputError, match=r"made_up\.json: no such file"):
         render_document(DOCUMENT.replace("two_view", "made_up"), results_dir)
 
 

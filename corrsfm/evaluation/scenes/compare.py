@@ -227,9 +227,10 @@ def _measure(run: SeedRun, seeds: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _models(workspace: Workspace) -> list[ModelSummary]:
     """Summaries of the models, the largest first: mapping has ranked them."""
-    from corrsfm.colmap.models import read_models, summarise_model
+    from corrsfm.colmap.models import summarise_model
+    from corrsfm.workspace.models import models_of
 
-    return [summarise_model(model) for model in read_models(workspace.sparse)]
+    return [summarise_model(model) for model in models_of(workspace)]
 
 
 def _pair_counts(base: Workspace, workspaces: dict[str, Workspace]) -> list[dict[str, Any]]:

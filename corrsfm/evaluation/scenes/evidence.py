@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from corrsfm.colmap.pairs import read_verified_matches
+from corrsfm.files import read_json
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import Views
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES
 from corrsfm.workspace.lists import read_index
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of
 
 __all__ = ["ModelEvidence", "common_evidence", "evidence_of"]
 
@@ -47,7 +46,7 @@ def evidence_of(workspace: Workspace, views: Views) -> ModelEvidence:
         Of its largest model.
     """
     try:
-        record = json.loads(workspace.evidence.read_text(encoding="utf-8"))
+        record = read_json(workspace.evidence)
         return ModelEvidence(
             explained_share=float(record["explained_share"]),
             num_contradicted_pairs=len(record["contradicted_pairs"]),
@@ -80,5 +79,5 @@ def common_evidence(workspaces: Sequence[Workspace], *, seed: int = 0) -> Iterat
     verified = {}
     for workspace in workspaces:
         verified.update(read_verified_matches(workspace.database))
-    with ItemStore(workspaces[0].features, FEATURES).reader() as load:
+    with features_of(workspaces[0]).reader() as load:
         yield SceneEvidence(read_index(workspaces[0]).names, verified, load, seed=seed)

@@ -17,9 +17,8 @@ from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
 from corrsfm.report.style import frame, section
 from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.hloc import FEATURES, MATCHES, PRUNED
 from corrsfm.workspace.lists import read_pairs
-from corrsfm.workspace.store import ItemStore
+from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 
 __all__ = ["write_page"]
 
@@ -214,7 +213,7 @@ def _drawn_pairs(
 ) -> list[str]:
     """A section for each pair, with a picture for each method."""
     oriented = {frozenset(pair): pair for pair in read_pairs(base).pairs}
-    features, putative = ItemStore(base.features, FEATURES), ItemStore(base.matches, MATCHES)
+    features, putative = features_of(base), matches_of(base)
     photo = functools.lru_cache(maxsize=2 * _NUM_DRAWN_PAIRS)(
         lambda name: read_photo(base.images_dir / name, _PHOTO_SIZE)
     )
@@ -248,4 +247,4 @@ def _drawn_pairs(
 
 def _kept_mask(workspace: Workspace, pair: Pair, indices: NDArray[np.int32]) -> NDArray[np.bool_]:
     # Column 0 of putative matches strictly increases, so it identifies a match.
-    return np.isin(indices[:, 0], ItemStore(workspace.pruned, PRUNED).read(pair).indices[:, 0])
+    return np.isin(indices[:, 0], pruned_of(workspace).read(pair).indices[:, 0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 
 from corrsfm.errors import InputError
 from corrsfm.evaluation.metrics import pose_auc, position_errors, relative_pose_errors
+from corrsfm.files import read_json
 from corrsfm.geometry import Pose, camera_centre
 from corrsfm.workspace import Workspace
 
@@ -162,7 +162,7 @@ def require_common_names(
 
 def _read_camera(path: Path) -> Pose:
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_json(path)
         rotation = np.array(values["rotation"], np.float64).reshape(3, 3)
         translation = np.array(values["translation"], np.float64).reshape(3)
     except (OSError, ValueError, KeyError, TypeError) as error:

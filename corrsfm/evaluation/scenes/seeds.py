@@ -8,7 +8,6 @@ mapped and chosen again. Finished seeds are kept; deleting ``.seeds`` costs only
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import os
 import statistics
@@ -19,7 +18,7 @@ from typing import Any
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
-from corrsfm.colmap.models import is_model, poses_of, read_models
+from corrsfm.colmap.models import is_model, poses_of
 from corrsfm.errors import ConfigError, ReconstructionError
 from corrsfm.evaluation.scenes.evidence import common_evidence, evidence_of
 from corrsfm.evaluation.scenes.score import (
@@ -29,11 +28,13 @@ from corrsfm.evaluation.scenes.score import (
     score_poses,
 )
 from corrsfm.evaluation.scenes.sharing import KEPT_MATCHES, PUTATIVE_MATCHES, share_stages
+from corrsfm.files import read_json
 from corrsfm.geometry import Pose
 from corrsfm.prune import depends_on_seed
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import views_of
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.models import models_of
 
 __all__ = [
     "SeedRun",
@@ -158,7 +159,7 @@ def measure_seed(
         A seed without a model has registered and explained nothing, and its AUC is 0.
     """
     workspace = run.workspace
-    model = None if run.failure else read_models(workspace.sparse)[0]
+    model = None if run.failure else models_of(workspace)[0]
     views = {} if model is None else views_of(model)
     found = None if model is None else evidence_of(workspace, views)
     poses = {} if model is None else poses_of(model)
@@ -256,7 +257,7 @@ def _config_of(workspace: Workspace, run: cfg.RunConfig) -> cfg.PipelineConfig:
     """The options that a workspace's models were made with, and their seed."""
     where = str(workspace.manifest)
     try:
-        last_run = json.loads(workspace.run_json.read_text(encoding="utf-8"))
+        last_run = read_json(workspace.run_json)
         if last_run["fingerprints"]["models"] == workspace.require("models").fingerprint:
             run = dataclasses.replace(run, seed=int(last_run["seed"]))
     except (OSError, ValueError, KeyError, TypeError):

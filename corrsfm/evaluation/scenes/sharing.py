@@ -18,7 +18,7 @@ def share_stages(base: Workspace, target: Workspace, stages: tuple[str, ...] = P
     """Give a workspace the photos and the first stages of another without copying them.
 
     What was made from a stage stays valid while the record of the stage is unchanged. Files are hard links;
-    stages replace files rather than change them, so neither workspace can harm the other.
+    who writes into one copies it first, so neither workspace can harm the other.
 
     Parameters
     ----------
@@ -30,7 +30,8 @@ def share_stages(base: Workspace, target: Workspace, stages: tuple[str, ...] = P
     target.images_dir = base.images_dir
     for stage in stages:
         for name in _FILES[stage]:
-            source, link = getattr(base, name), getattr(target, name)
+            source = getattr(base, name)
+            link = target.root / source.relative_to(base.root)
             if source.exists():
                 share_file(source, link)
             else:

@@ -53,7 +53,7 @@ def test_every_method_is_measured_on_the_same_matches(compared: tuple[Path, dict
     ratio, loransac = values["methods"].values()
     assert loransac["num_kept_matches"] < ratio["num_kept_matches"]
     assert loransac["inlier_ratio"] > ratio["inlier_ratio"]
-    for name in ("features.h5", "matches.h5"):
+    for name in ("features.db", "matches.db"):
         files = [folder / "out" / part / name for part in ("base", "ratio", "loransac")]
         assert len({os.stat(path).st_ino for path in files}) == 1
 
@@ -99,8 +99,8 @@ def test_seeds_share_what_does_not_depend_on_them(compared: tuple[Path, dict]):
     folder, _ = compared
     for method, num_kept_files in (("ratio", 1), ("loransac", 3)):
         places = [folder / "out" / method / place for place in (".", ".seeds/1", ".seeds/2")]
-        assert len({os.stat(place / "features.h5").st_ino for place in places}) == 1
-        assert len({os.stat(place / "pruned.h5").st_ino for place in places}) == num_kept_files
+        assert len({os.stat(place / "features.db").st_ino for place in places}) == 1
+        assert len({os.stat(place / "pruned" / f"{method}.db").st_ino for place in places}) == num_kept_files
         assert len({(place / "database.db").read_bytes() for place in places}) == 3
 
 

@@ -129,7 +129,7 @@ def test_seeds_follow_the_options_of_the_workspace(scene: Path, made: Path) -> N
     other = Workspace(scene / ".seeds" / "4")
     for stage in ("pruned matches", "verified matches", "models"):
         assert other.require(stage).config == workspace.require(stage).config
-    assert (scene / ".seeds/4/pruned.h5").stat().st_ino == (scene / "pruned.h5").stat().st_ino
+    assert (scene / ".seeds/4/pruned/ratio.db").stat().st_ino == workspace.pruned.stat().st_ino
 
 
 def test_a_seed_that_fails_is_a_result(scene: Path, made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,16 +149,16 @@ def test_one_seed_or_a_bare_model_is_measured_alone(scene: Path, made: Path) -> 
     assert result.stdout.endswith("\none model: --seeds 1\n") and "median " in result.stdout
     assert json.loads(evaluate(scene, made, "--seeds", 1, "--json").stdout) == own
     assert evaluate(scene / "sparse" / "0", made).stdout.endswith("\none model: it is not in a workspace\n")
-    (scene / "features.h5").unlink()
-    assert evaluate(scene, made).stdout.endswith("\none model: features.h5 of its workspace is gone\n")
+    (scene / "features.db").unlink()
+    assert evaluate(scene, made).stdout.endswith("\none model: features.db of its workspace is gone\n")
     assert not (scene / ".seeds").exists()
 
 
 def test_putative_matches_are_needed_only_by_methods_that_draw_at_random(scene: Path) -> None:
     workspace = Workspace(scene)
-    workspace.matches.rename(scene / "away.h5")
-    assert why_one_model(scene) == "matches.h5 of its workspace is gone"
-    (scene / "away.h5").rename(workspace.matches)
+    workspace.matches.rename(scene / "away.db")
+    assert why_one_model(scene) == "matches.db of its workspace is gone"
+    (scene / "away.db").rename(workspace.matches)
     run = dataclasses.replace(CONFIG.run, seed=SEED)
     pipeline.prune_matches(workspace, cfg.PruneConfig(method=cfg.PruneMethod.RATIO), run)
     workspace.matches.unlink()
