@@ -57,6 +57,8 @@ def extract_features(
     store = features_of(workspace)
     if (source := imported_from(workspace, "features")) is not None:
         traits_to_come(workspace, config, cfg.MatchesConfig())
+        if run.verify:
+            store.require_whole()
         return complete(
             workspace,
             "features",

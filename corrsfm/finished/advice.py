@@ -25,8 +25,8 @@ def command_again(workspace: Workspace, stage: str, *flags: str) -> str:
         Words to add to the first command.
     """
     stages = list(STAGE_COMMANDS)
-    commands = list(dict.fromkeys(workspace.command_for(one) for one in stages[stages.index(stage) :]))
-    return "; ".join([" ".join([commands[0], *map(shlex.quote, flags)]), *commands[1:]])
+    first, *others = dict.fromkeys(workspace.command_for(one) for one in stages[stages.index(stage) :])
+    return "; ".join([workspace.command_for(stage, *flags), *others])
 
 
 def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
@@ -52,7 +52,7 @@ def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
 def more_photos_to_add(workspace: Workspace, where: str) -> str:
     """Photos that make a model firmer, which stays where it is unless its features were imported."""
     if imported_from(workspace, "features") is not None:
-        command = f"{workspace.command_for('features')} --overwrite"
+        command = workspace.command_for("features")
         return f"take photos {where}, make a file of features that holds them too, then: {command}"
     return f"take photos {where}, then: corrsfm add {shlex.quote(str(workspace.root))} NEWPHOTOS"
 

@@ -144,7 +144,7 @@ def refuse_imported(workspace: Workspace) -> None:
         raise InputError(
             f"{workspace.root}: the features of this scene were imported, and corrsfm cannot make those of "
             "other photos; import a file that holds them too: "
-            f"{workspace.command_for('features')} --overwrite"
+            f"{workspace.command_for('features')}"
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import hashlib
+import json
 import logging
 import shutil
 from collections.abc import Callable, Mapping
@@ -24,6 +25,7 @@ from corrsfm.types import Features, ImageRecord, Matches, Pair, PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import (
     fingerprint_of_imported,
+    is_unfinished_import,
     record_imported_pairs,
 )
 from corrsfm.workspace.items import FEATURES, MATCHES, Arrays
@@ -157,7 +159,7 @@ def _import(
 ) -> ImportResult:
     workspace = Workspace(folder, create=True, images_dir=photos)
     with workspace.lock():
-        if workspace.features.exists() and not overwrite:
+        if workspace.features.exists() and not overwrite and not is_unfinished_import(workspace):
             raise WorkspaceError(
                 f"{workspace.features}: is there already; choose another folder, or add --overwrite to "
                 "replace these features and what was made from them"
@@ -213,12 +215,15 @@ def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, inde
         logger.warning("%s", remark)
     kind = cfg.FeatureKind.SIFT if is_sift else files.kind
     config = dataclasses.replace(files, kind=kind, has_shapes=has_shapes)
-    for stage in ("pairs", "matches"):
+    for stage in ("features", "pairs", "matches"):
         workspace.forget(stage)
+    # Both before the first item: features without the matches that came with them must not look finished.
+    features_of(workspace).clear(json.dumps(cfg.to_dict(config)))
+    matches_of(workspace).clear(json.dumps(cfg.to_dict(config)) if pairs else "")
     complete(
         workspace, "features", features_of(workspace), wanted,
         lambda missing: ((name, read(name)) for name in missing), config,
-        inputs={"images": workspace.require("images").fingerprint}, overwrite=True, unit="photo",
+        inputs={"images": workspace.require("images").fingerprint}, overwrite=False, unit="photo",
     )  # fmt: skip
     if pairs:
         origins = tuple(("import",) for _ in pairs)
@@ -227,7 +232,7 @@ def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, inde
         complete(
             workspace, "matches", matches_of(workspace), wanted_pairs,
             lambda missing: ((pair, read_pair(pair)) for pair in missing), config,
-            inputs=inputs, overwrite=True, unit="pair",
+            inputs=inputs, overwrite=False, unit="pair",
         )  # fmt: skip
     return ImportResult(
         workspace=workspace.root,

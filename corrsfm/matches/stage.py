@@ -39,6 +39,8 @@ def match_pairs(
     store = matches_of(workspace)
     inputs = {"features": features.fingerprint, "pairs": pairs.fingerprint}
     if (source := imported_from(workspace, "matches")) is not None:
+        if run.verify:
+            store.require_whole()
         wanted = imported_matches(workspace)
         return complete(
             workspace, "matches", store, wanted, lambda missing: [], source,

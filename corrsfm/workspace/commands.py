@@ -47,7 +47,13 @@ def label_of(stage: str) -> str:
     return "kept matches" if stage == "pruned matches" else stage
 
 
-def command_for(stage: str, root: Path, photos: Sequence[str], recorded: Mapping[str, dict[str, Any]]) -> str:
+def command_for(
+    stage: str,
+    root: Path,
+    photos: Sequence[str],
+    recorded: Mapping[str, dict[str, Any]],
+    flags: Sequence[str] = (),
+) -> str:
     """The command that makes a stage, with the options that it was made with, quoted for a shell.
 
     The seed is not recorded with a stage and so not repeated.
@@ -61,6 +67,9 @@ def command_for(stage: str, root: Path, photos: Sequence[str], recorded: Mapping
         What the user named as photos, or a word in its place.
     recorded : mapping
         Stage → the options that it was made with, of the stages that finished.
+    flags : sequence of str
+        Further words. What was imported can only be imported again, in place of what is there, whatever they
+        ask for.
     """
     if "has_shapes" in recorded.get(stage, {}):
         return _import_command(root, photos, recorded)
@@ -69,7 +78,7 @@ def command_for(stage: str, root: Path, photos: Sequence[str], recorded: Mapping
     for name, options in _OPTIONS[command].items():
         if name in recorded:
             words += flags_of(options, recorded[name])
-    return shlex.join(words)
+    return shlex.join([*words, *flags])
 
 
 def _import_command(root: Path, photos: Sequence[str], recorded: Mapping[str, dict[str, Any]]) -> str:
@@ -78,4 +87,4 @@ def _import_command(root: Path, photos: Sequence[str], recorded: Mapping[str, di
     words = ["corrsfm", "import", *photos, str(root), *flags_of(cfg.ImportedConfig, source)]
     if source.get("database") and "has_shapes" not in recorded.get("matches", {}):
         words.append("--rematch")
-    return shlex.join(words + flags_of(cfg.ImagesConfig, recorded.get("images", {})))
+    return shlex.join([*words, *flags_of(cfg.ImagesConfig, recorded.get("images", {})), "--overwrite"])

@@ -45,6 +45,7 @@ import shutil
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from corrsfm import config as cfg
 from corrsfm.colmap.sqlite import rows_digest
@@ -360,7 +361,9 @@ class Workspace:
         except WorkspaceError:
             return None
 
-    def command_for(self, stage: str, *, images_dir: str | None = None) -> str:
+    def command_for(
+        self, stage: str, *flags: str, images_dir: str | None = None, imported: dict[str, Any] | None = None
+    ) -> str:
         """The command that makes a stage, with the options that it was made with, quoted for a shell.
 
         The seed is not recorded with a stage and so not repeated.
@@ -368,14 +371,22 @@ class Workspace:
         Parameters
         ----------
         stage : str
+        flags : str
+            Further options, such as ``--overwrite``; what was imported is imported again whatever they are.
         images_dir : str, optional
             To take the place of the folder of photos that the workspace knows.
+        imported : dict, optional
+            Where the stage was imported from, if it has no record.
         """
+        recorded = {name: StageRecord(**values).config for name, values in self._values["stages"].items()}
+        if imported is not None:
+            recorded |= {"features": imported, stage: imported}
         return command_for(
             stage,
             self.root,
             [images_dir] if images_dir else self.given_photos or ["PHOTOS"],
-            {name: StageRecord(**values).config for name, values in self._values["stages"].items()},
+            recorded,
+            flags,
         )
 
     def finish(self, stage: str, record: StageRecord) -> None:

@@ -1,11 +1,13 @@
 """What a scene's features and matches are: made here, or brought in by `corrsfm import`.
 
 Imported features carry the fingerprint ``imported PHOTO CONTENT``, two hashes: they hold as long as the photo
-does, and no extractor could make them again.
+does, and no extractor could make them again. Their file says where they came from, so that a workspace that
+lost its manifest, or an import that was killed, is not taken for one that has no features yet.
 """
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from corrsfm import config as cfg
@@ -21,6 +23,7 @@ __all__ = [
     "imported_features",
     "imported_from",
     "imported_matches",
+    "is_unfinished_import",
     "record_imported_pairs",
     "traits_of",
     "traits_to_come",
@@ -31,11 +34,39 @@ _IMPORTED = "imported"
 
 
 def imported_from(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
-    """Where what a stage recorded was imported from; None if the stage made it itself."""
-    record = workspace.record_of(stage)
-    if record is None or "has_shapes" not in record.config:
+    """Where what a stage left was imported from; None if the stage made it itself, or has nothing yet.
+
+    Raises
+    ------
+    WorkspaceError
+        If an import was not finished.
+    """
+    if (record := workspace.record_of(stage)) is None:
+        return _unrecorded(workspace, stage)
+    return _source(workspace, record.config) if "has_shapes" in record.config else None
+
+
+def _unrecorded(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
+    """Where the items of a stage without a record were imported from; pairs come with their matches."""
+    store = features_of(workspace) if stage == "features" else matches_of(workspace)
+    origin = store.origin()
+    if origin is None:
         return None
-    return cfg.from_dict(cfg.ImportedConfig, record.config, str(workspace.manifest))
+    config = json.loads(origin)
+    if store.seal() is None:
+        command = workspace.command_for(stage, imported=config)
+        raise WorkspaceError(f"{store.path}: an import was not finished; run: {command}")
+    return _source(workspace, config)
+
+
+def _source(workspace: Workspace, config: dict[str, Any]) -> cfg.ImportedConfig:
+    return cfg.from_dict(cfg.ImportedConfig, config, str(workspace.manifest))
+
+
+def is_unfinished_import(workspace: Workspace) -> bool:
+    """Whether an import into the workspace was begun and came to no end."""
+    origins = {"features": features_of(workspace).origin(), "matches": matches_of(workspace).origin()}
+    return any(workspace.record_of(stage) is None and origin is not None for stage, origin in origins.items())
 
 
 def fingerprint_of_imported(photo_sha256: str, content: str) -> str:
@@ -53,6 +84,7 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
     """
     records = read_index(workspace).records
     store = features_of(workspace)
+    source = imported_from(workspace, "features")
     held = store.held([record.name for record in records])
     lacking = [
         record.name
@@ -60,10 +92,11 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
         if not held.get(record.name, "").startswith(f"{_IMPORTED} {record.sha256} ")
     ]
     if lacking:
+        command = workspace.command_for("features", imported=cfg.to_dict(source))
         raise WorkspaceError(
             f"{workspace.features}: was imported and holds no features of {first_few(lacking)}, new or "
-            f"changed since; import again ({workspace.command_for('features')} --overwrite), or leave these "
-            "photos out with --image-list"
+            f"changed since; import a file that does, with: {command}; or leave these photos out with "
+            "--image-list"
         )
     return {record.name: held[record.name] for record in records}
 

@@ -140,5 +140,5 @@ def read_pairs(workspace: Workspace) -> PairList:
     except FileNotFoundError as error:
         raise WorkspaceError(f"{path}: missing; run: {workspace.command_for('pairs')}") from error
     except (OSError, ValueError) as error:
-        command = f"{workspace.command_for('pairs')} --overwrite"
+        command = workspace.command_for("pairs", "--overwrite")
         raise WorkspaceError(f"{path}: damaged ({error}); run: {command}") from error

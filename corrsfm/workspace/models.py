@@ -67,7 +67,7 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
     }
     for folder in sorted(places):
         if not _can_be_read(folder):
-            remedy = f"{workspace.command_for('models')} --overwrite"
+            remedy = workspace.command_for("models", "--overwrite")
             raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")
         logger.warning("%s: changed since corrsfm wrote it; it is used as it is", folder)
     return read_models(workspace.sparse)

@@ -130,6 +130,7 @@ def complete(
     try:
         if overwrite:
             discard_shards(workspace, store)
+            store.renew()
         elif merge_shards(workspace, store):
             finished = store.finished(wanted)
             missing = [key for key in wanted if key not in finished]

@@ -23,7 +23,7 @@ __all__ = [
     "insert_row",
     "is_intact",
     "make_row",
-    "readable_rows",
+    "new_file",
     "transaction",
     "unpack",
 ]
@@ -31,10 +31,6 @@ __all__ = [
 FORMAT_VERSION = 1
 APPLICATION_ID = 0x6373666D
 """Says "csfm" to programs that look into the header of an SQLite file."""
-
-LARGEST_GAP = 1 << 20
-LARGEST_NUMBER = 2**63 - 1
-MOST_ROWS_OF_A_PAGE = 4096
 
 # Arrays lie apart, so that looking up what is finished does not read them.
 _SCHEMA = """
@@ -62,6 +58,15 @@ def create_tables(connection: sqlite3.Connection, kind: str) -> None:
         connection.execute("INSERT INTO about VALUES ('kind', ?)", (kind,))
         connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {FORMAT_VERSION}")
+
+
+@contextlib.contextmanager
+def new_file(path: Path, kind: str) -> Iterator[sqlite3.Connection]:
+    """Make a file of no items, and no other beside it."""
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+        connection.execute("PRAGMA journal_mode = MEMORY")
+        create_tables(connection, kind)
+        yield connection
 
 
 def make_row(
@@ -111,44 +116,6 @@ def transaction(connection: sqlite3.Connection) -> Iterator[None]:
             connection.execute("ROLLBACK")
         raise
     connection.execute("COMMIT")
-
-
-def readable_rows(path: Path) -> Iterator[tuple[Any, ...]]:
-    """Rows of a damaged file that can be read, one look-up each, so that a broken page costs its own only.
-
-    A file that was cut short is filled up with zeros first: SQLite refuses all of it otherwise.
-    """
-    with open(path, "r+b") as file:
-        header = file.read(100).ljust(100, b"\0")
-        page_size, num_pages = int.from_bytes(header[16:18]), int.from_bytes(header[28:32])
-        num_bytes = num_pages * (page_size if page_size > 1 else 65536)
-        # A damaged header may promise anything.
-        if path.stat().st_size < num_bytes < 2 * path.stat().st_size + LARGEST_GAP:
-            file.truncate(num_bytes)
-    with (
-        contextlib.suppress(sqlite3.DatabaseError),
-        contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection,
-    ):
-        connection.text_factory = lambda raw: raw.decode("utf-8", "replace")
-        number, num_missed = 0, 0
-        while number < LARGEST_NUMBER:
-            try:
-                (found,) = connection.execute(
-                    "SELECT min(number) FROM items WHERE number > ?", (number,)
-                ).fetchone()
-            except sqlite3.DatabaseError:
-                found = number
-            if found is None:
-                return
-            # A broken tree may also answer with a row that was not asked for, and again and again.
-            if found <= number:
-                # On a broken page all its rows are missed one by one; where more is, in ever longer steps.
-                number += 1 << max(0, num_missed - MOST_ROWS_OF_A_PAGE)
-                num_missed += 1
-                continue
-            number, num_missed = found, 0
-            with contextlib.suppress(sqlite3.DatabaseError):
-                yield from connection.execute(f"{WHOLE_ROWS} WHERE items.number = ?", (number,)).fetchall()
 
 
 def _pack(arrays: Mapping[str, NDArray]) -> tuple[str, bytes]:

@@ -13,7 +13,6 @@ import itertools
 import json
 import logging
 import os
-import shlex
 import shutil
 import sqlite3
 import threading
@@ -23,18 +22,18 @@ from pathlib import Path
 from typing import Any, Generic
 
 from corrsfm.errors import DamageError, InputError, WorkspaceError, first_few
-from corrsfm.files import atomic_path, share_file, sync_folder
+from corrsfm.files import atomic_path, sync_folder
 from corrsfm.workspace.items import Arrays, Attributes, K, Kind, T
+from corrsfm.workspace.mending import rebuild
 from corrsfm.workspace.rows import (
     APPLICATION_ID,
     FORMAT_VERSION,
     WHOLE_ROWS,
-    create_tables,
     delete_item,
     insert_row,
     is_intact,
     make_row,
-    readable_rows,
+    new_file,
     transaction,
     unpack,
 )
@@ -70,14 +69,19 @@ class ItemStore(Generic[K, T]):
     kind : Kind
     remedy : str
         The command that makes the items, for messages.
+    mend : str
+        The command that makes damaged items again; the remedy with --verify if not given.
     seal : str, optional
         What `commit` was given when the file was finished; another file in its place is refused.
     """
 
-    def __init__(self, path: Path, kind: Kind[K, T], *, remedy: str = "", seal: str | None = None) -> None:
+    def __init__(
+        self, path: Path, kind: Kind[K, T], *, remedy: str = "", mend: str = "", seal: str | None = None
+    ) -> None:
         self.path = path
         self.kind = kind
         self._remedy = remedy or "the step that makes it"
+        self._mend = mend or f"{self._remedy} --verify"
         self._seal = seal
         self._writing: sqlite3.Connection | None = None
         self._synced = 0.0
@@ -183,6 +187,13 @@ class ItemStore(Generic[K, T]):
         with self._reading(sealed=False) as connection, self._errors():
             return self._about(connection).get("seal")
 
+    def origin(self) -> str | None:
+        """What `clear` was given when the file was begun; None if nothing, or if there is no file."""
+        if not self.path.exists():
+            return None
+        with self._reading(sealed=False) as connection, self._errors():
+            return self._about(connection).get("origin")
+
     def seconds(self) -> float:
         """Seconds that the items took to make, over all runs."""
         with self._reading(sealed=False) as connection, self._errors():
@@ -210,6 +221,17 @@ class ItemStore(Generic[K, T]):
                     damaged.append(str(row[0]))
         return damaged
 
+    def require_whole(self) -> None:
+        """Read every item.
+
+        Raises
+        ------
+        WorkspaceError
+            If the file is missing, or anything in it is damaged, with what mends it.
+        """
+        if damaged := self.find_damage():
+            raise self._damaged(f"the checksum of {first_few([_shown(key) for key in damaged])}")
+
     @contextlib.contextmanager
     def _reading(self, *, sealed: bool = True) -> Iterator[sqlite3.Connection]:
         """A connection to read from: that of the writer if there is one."""
@@ -230,9 +252,7 @@ class ItemStore(Generic[K, T]):
             with self._errors():
                 about = self._about(connection)
             if sealed and self._seal is not None and about.get("seal") != self._seal:
-                raise WorkspaceError(
-                    f"{self.path}: is not the file that its step wrote; run: {self._remedy} --verify"
-                )
+                raise WorkspaceError(f"{self.path}: is not the file that its step wrote; run: {self._mend}")
             yield connection
 
     def _merge_log(self) -> None:
@@ -284,7 +304,7 @@ class ItemStore(Generic[K, T]):
             raise self._damaged(f"{_shown(row[0])}: {error}") from error
 
     def _lacks(self, key: str) -> WorkspaceError:
-        return WorkspaceError(f"{self.path}: holds nothing for {_shown(key)}; run: {self._remedy} --verify")
+        return WorkspaceError(f"{self.path}: holds nothing for {_shown(key)}; run: {self._mend}")
 
     @contextlib.contextmanager
     def _errors(self) -> Iterator[None]:
@@ -299,7 +319,7 @@ class ItemStore(Generic[K, T]):
             raise self._damaged(error) from error
 
     def _damaged(self, what: object) -> DamageError:
-        return DamageError(f"{self.path}: damaged ({what}); run: {self._remedy} --verify")
+        return DamageError(f"{self.path}: damaged ({what}); run: {self._mend}")
 
     # writing ------------------------------------------------------------------------------------------------
 
@@ -325,7 +345,7 @@ class ItemStore(Generic[K, T]):
         WorkspaceError
             If the other file is damaged or of another kind, or the disk is full.
         """
-        source = ItemStore(other, self.kind, remedy=self._remedy)
+        source = ItemStore(other, self.kind, remedy=self._remedy, mend=self._mend)
         num = 0
         with source._reading(sealed=False) as reading, self._changing() as connection:
             for row in reading.execute(WHOLE_ROWS):
@@ -392,7 +412,12 @@ class ItemStore(Generic[K, T]):
         try:
             damaged = self.find_damage()
         except DamageError as error:
-            return [self._rebuild(error)]
+            self._drop_connection()
+            aside = self.path.with_name(f"{self.path.name}.damaged")
+            with self._errors():
+                num = rebuild(self.path, self.kind.label, aside)
+            kept = f"{num} whole items are kept, and the old file as {aside.name}"
+            return [f"{self.path}: damaged ({error.__cause__}); {kept}"]
         if not damaged:
             return []
         with self._changing() as connection:
@@ -400,46 +425,43 @@ class ItemStore(Generic[K, T]):
                 delete_item(connection, key)
         return [f"{self.path}: damaged items are made again: {first_few([_shown(key) for key in damaged])}"]
 
-    def _rebuild(self, error: DamageError) -> str:
-        """Put a file with the whole items of a damaged one in its place, and the damaged one aside."""
-        self._drop_connection()
-        aside = self.path.with_name(f"{self.path.name}.damaged")
-        num = 0
-        # The damaged file keeps its name until the new one is whole: an interruption must not cost its items.
-        with atomic_path(self.path) as new:
-            with self._errors(), self._creating(new) as connection, transaction(connection):
-                for row in self._rows_left():
-                    with contextlib.suppress(DamageError):
-                        self._checked(row)
-                        insert_row(connection, row)
-                        num += 1
-            self._put_aside(aside)
-        kept = f"{num} whole items are kept, and the old file as {aside.name}"
-        return f"{self.path}: damaged ({error.__cause__}); {kept}"
+    def renew(self) -> None:
+        """Make sure that every item can be written again; a file that cannot take them is begun anew.
 
-    def _put_aside(self, aside: Path) -> None:
-        """Give the damaged file and its logs another name; a file keeps its own too, until it is replaced."""
-        try:
-            if self.path.is_file() and not aside.is_dir():
-                share_file(self.path, aside)
-            else:
-                os.replace(self.path, aside)
-            for suffix in ("-wal", "-shm", "-journal"):
-                with contextlib.suppress(FileNotFoundError):
-                    os.replace(self._beside(suffix), aside.with_name(aside.name + suffix))
-        except (IsADirectoryError, NotADirectoryError) as problem:
-            raise WorkspaceError(f"{aside}: is in the way; move it away and run again") from problem
-
-    def _rows_left(self) -> Iterator[tuple[Any, ...]]:
-        if not self.path.is_file():
+        Raises
+        ------
+        WorkspaceError
+            If nothing can be written there.
+        """
+        if not self.path.exists():
             return
         try:
-            yield from readable_rows(self.path)
-        except PermissionError as error:
-            raise WorkspaceError(
-                f"{self.path}: damaged, and cannot be mended ({error.strerror}); make it writable, with: "
-                f"chmod u+w {shlex.quote(str(self.path))}"
-            ) from error
+            with self._errors():
+                (problem,) = self._writer().execute("PRAGMA quick_check(1)").fetchone()
+            if problem != "ok":
+                raise self._damaged(problem)
+        except DamageError:
+            self.clear()
+
+    def clear(self, origin: str = "") -> None:
+        """Begin the file anew, whatever is there.
+
+        Parameters
+        ----------
+        origin : str
+            Kept in the file, see `origin`.
+
+        Raises
+        ------
+        WorkspaceError
+            If nothing can be written there.
+        """
+        self._drop_connection()
+        with atomic_path(self.path) as new, self._errors(), new_file(new, self.kind.label) as connection:
+            if origin:
+                connection.execute("INSERT INTO about VALUES ('origin', ?)", (origin,))
+        for suffix in ("-wal", "-shm", "-journal"):
+            self._beside(suffix).unlink(missing_ok=True)
 
     def close(self) -> None:
         """Make everything safe on the disk and end writing; the items stay for the next run.
@@ -504,21 +526,12 @@ class ItemStore(Generic[K, T]):
     def _prepare(self) -> None:
         """See to it that there is a file of this store's own."""
         if not self.path.exists():
-            with atomic_path(self.path) as new, self._errors(), self._creating(new):
+            with atomic_path(self.path) as new, self._errors(), new_file(new, self.kind.label):
                 pass
         # Other workspaces that read it by another name keep what they have.
         elif self.path.stat().st_nlink > 1:
             with atomic_path(self.path) as copy:
                 shutil.copy2(self.path, copy)
-
-    @contextlib.contextmanager
-    def _creating(self, new: Path) -> Iterator[sqlite3.Connection]:
-        """A new file of no items that is not in place yet."""
-        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
-            # No file beside it.
-            connection.execute("PRAGMA journal_mode = MEMORY")
-            create_tables(connection, self.kind.label)
-            yield connection
 
     def _beside(self, suffix: str) -> Path:
         return self.path.with_name(self.path.name + suffix)

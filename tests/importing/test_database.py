@@ -46,7 +46,7 @@ def test_sift_of_an_old_database_comes_in_with_its_matches(
     assert scene.pairs == ((names[1], names[2]),)
     np.testing.assert_array_equal(scene.matches(scene.pairs[0]).indices[:, 0], np.arange(1, NUM, 2))
     command = Workspace(tmp_path / "scene").command_for("features")
-    assert command.endswith(f"--database {path} --kind sift")
+    assert command.endswith(f"--database {path} --kind sift --overwrite")
 
 
 def test_a_database_in_a_folder_with_an_odd_name_is_read(
@@ -64,7 +64,7 @@ def test_matches_may_be_left(photos: Path, names: list[str], tmp_path: Path) -> 
         photos, tmp_path / "scene", database=tmp_path / "database.db", with_matches=False
     )
     assert result.num_pairs == 0
-    assert Workspace(tmp_path / "scene").command_for("features").endswith("--rematch")
+    assert Workspace(tmp_path / "scene").command_for("features").endswith("--rematch --overwrite")
 
 
 def test_affine_shapes_become_scale_and_orientation(photos: Path, names: list[str], tmp_path: Path) -> None:

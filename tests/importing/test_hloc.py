@@ -1,6 +1,9 @@
 """hloc's files come in as they are, or not at all."""
 
+import contextlib
+import dataclasses
 import logging
+import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,6 +20,8 @@ from corrsfm.errors import ConfigError, CorrsfmError, InputError, WorkspaceError
 from corrsfm.finished.advice import more_photos_to_add
 from corrsfm.importing.scene import import_features
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.imported import imported_from
+from corrsfm.workspace.resume import complete
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 
@@ -291,3 +296,72 @@ def test_lightglue_is_not_asked_for_features_that_it_does_not_know(
     import_features(photos, tmp_path / "other", features=features, matches=tmp_path / "matches.h5")
     with pytest.raises(ConfigError, match="matches were imported and are kept"):
         pipeline.match_pairs(Workspace(tmp_path / "other"), lightglue, RUN)
+
+
+@pytest.fixture
+def matched(tmp_path: Path, names: list[str]) -> Path:
+    write_matches(tmp_path / "matches.h5", [(names[0], names[1]), (names[1], names[2])])
+    return tmp_path / "matches.h5"
+
+
+def go_on(workspace: Workspace, photos: Path, run: cfg.RunConfig = RUN) -> None:
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(), run)
+    pipeline.extract_features(workspace, cfg.FeaturesConfig(), run)
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), run)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(), run)
+
+
+def test_an_import_outlives_the_manifest(
+    photos: Path, features: Path, matched: Path, tmp_path: Path, names: list[str]
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features, matches=matched)
+    workspace = Workspace(tmp_path / "scene")
+    go_on(workspace, photos)
+    recorded = {stage: workspace.record_of(stage).fingerprint for stage in ("features", "matches")}
+    workspace.manifest.unlink()
+    workspace = Workspace(tmp_path / "scene", create=True)
+    go_on(workspace, photos)
+    assert {stage: workspace.record_of(stage).fingerprint for stage in recorded} == recorded
+    assert imported_from(workspace, "features").features == features
+
+
+@pytest.mark.parametrize("stage", ["features", "matches"])
+def test_a_killed_import_is_not_mistaken_for_none(
+    stage: str, photos: Path, features: Path, matched: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(workspace: Workspace, which: str, *rest: object, **options: object) -> object:
+        if which == stage:
+            raise KeyboardInterrupt
+        return complete(workspace, which, *rest, **options)
+
+    (tmp_path / "scene").mkdir()
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr("corrsfm.importing.scene.complete", fail)
+        import_features(photos, tmp_path / "scene", features=features, matches=matched)
+    with pytest.raises(WorkspaceError, match=r"not finished; run: corrsfm import .*matches\.h5"):
+        go_on(Workspace(tmp_path / "scene"), photos)
+    # The same command again is enough.
+    import_features(photos, tmp_path / "scene", features=features, matches=matched)
+    go_on(Workspace(tmp_path / "scene"), photos)
+
+
+@pytest.mark.parametrize("name", ["features.db", "matches.db"])
+@pytest.mark.parametrize("way", ["cut", "row"])
+def test_damaged_imports_are_kept_until_they_are_imported_again(
+    name: str, way: str, photos: Path, features: Path, matched: Path, tmp_path: Path
+) -> None:
+    import_features(photos, tmp_path / "scene", features=features, matches=matched)
+    path = tmp_path / "scene" / name
+    if way == "cut":
+        path.write_bytes(path.read_bytes()[:5000])
+    else:
+        with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
+            connection.execute("UPDATE arrays SET data = zeroblob(length(data)) WHERE number = 2")
+    before = path.read_bytes()
+    # One row is noticed where it is read; else by --verify.
+    for verify in (False, True) if way == "cut" else (True,):
+        with pytest.raises(WorkspaceError, match=r"corrsfm import .* --overwrite$"):
+            go_on(Workspace(tmp_path / "scene"), photos, dataclasses.replace(RUN, verify=verify))
+        assert path.read_bytes() == before
+    import_features(photos, tmp_path / "scene", features=features, matches=matched, overwrite=True)
+    go_on(Workspace(tmp_path / "scene"), photos, dataclasses.replace(RUN, verify=True))

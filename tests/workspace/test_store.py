@@ -13,6 +13,7 @@ import pytest
 
 from corrsfm.errors import DamageError, WorkspaceError
 from corrsfm.types import Features, Matches, PruneResult, TwoViewModel
+from corrsfm.workspace import mending
 from corrsfm.workspace import store as store_module
 from corrsfm.workspace.items import FEATURES, MATCHES, PRUNED, PrunedMatches
 from corrsfm.workspace.store import ItemStore
@@ -386,7 +387,7 @@ def test_an_interrupted_mending_costs_no_item(store: ItemStore, monkeypatch: pyt
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(store_module, "insert_row", interrupt)
+        patch.setattr(mending, "insert_row", interrupt)
         store.mend()
     assert [path.name for path in store.path.parent.iterdir()] == [store.path.name]
     (lost,) = store.mend()
