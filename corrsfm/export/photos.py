@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from corrsfm.colmap.log import colmap_log
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import sha256_of
-from corrsfm.images.photos import read_photo_info
+from corrsfm.images.photos import read_image, read_photo_info
 
 __all__ = [
     "check_photos",
@@ -25,26 +26,29 @@ __all__ = [
     "undistort",
 ]
 
+logger = logging.getLogger("corrsfm")
+
 _JPEG_QUALITY = 95
 _NUM_BORDER_SAMPLES = 33
 _LARGEST_RETURN_ERROR_PX = 0.5
 
 
 def check_photos(model: pycolmap.Reconstruction, images_dir: Path, hashes: Mapping[str, str]) -> None:
-    """Refuse to begin if photos are gone or are not those of the model; COLMAP would abort the process.
+    """Refuse to begin if photos are gone, damaged or of another size; COLMAP would abort the process.
+
+    Photos with another content and the same size, such as ones with corrected colours, are warned of.
 
     Parameters
     ----------
     model : pycolmap.Reconstruction
     images_dir : Path
     hashes : mapping of str to str
-        Photo → SHA-256 of the file that was reconstructed. A photo with another hash, such as one with
-        corrected colours, only needs the same size.
+        Photo → SHA-256 of the file that was reconstructed.
 
     Raises
     ------
     InputError
-        Naming the photos.
+        Naming the photos; `ImageError` for one that cannot be read to the end.
     """
     images = sorted(model.images.values(), key=lambda image: image.name)
     missing = [image.name for image in images if not (images_dir / image.name).is_file()]
@@ -53,6 +57,7 @@ def check_photos(model: pycolmap.Reconstruction, images_dir: Path, hashes: Mappi
             f"{images_dir}: {len(missing)} photos of the model are not there: {first_few(missing)}; if the "
             "folder was moved, say where it is with --images FOLDER"
         )
+    changed = []
     for image in images:
         path, camera = images_dir / image.name, model.cameras[image.camera_id]
         if sha256_of(path) == hashes.get(image.name):
@@ -63,6 +68,15 @@ def check_photos(model: pycolmap.Reconstruction, images_dir: Path, hashes: Mappi
                 f"{path}: has {info.width}×{info.height} pixels, but {camera.width}×{camera.height} when it "
                 "was reconstructed; put the photo of that size back, or run the scene again with the new one"
             )
+        read_image(path)
+        changed.append(image.name)
+    if changed:
+        logger.warning(
+            "changed since they were reconstructed: %s in %s; that is fine for other colours; if they show "
+            "something else, put the earlier ones back or run the scene again",
+            first_few(changed),
+            images_dir,
+        )
 
 
 def copy_photos(names: Iterable[str], images_dir: Path, folder: Path) -> None:

@@ -15,12 +15,14 @@ import pycolmap
 from corrsfm.errors import first_few
 from corrsfm.finished.advice import command_again, more_photos_to_add, more_photos_to_map, next_step
 from corrsfm.finished.integrity import Damage, find_damage
+from corrsfm.images.cache import PhotoCache, photos_unlike
 from corrsfm.reconstruction.explained import CONTRADICTED_BELOW
 from corrsfm.report.missing import MissingPhoto
 from corrsfm.report.stage import summarise
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import PairStatistics
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.lists import read_index
 
 __all__ = ["Bridge", "HeldPhoto", "SceneFinding", "WorkspaceCheck", "check_workspace"]
 
@@ -87,7 +89,7 @@ class SceneFinding:
     Attributes
     ----------
     kind : str
-        ``damage``, ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
+        ``damage``, ``photos``, ``model``, ``verdict``, ``parts``, ``models``, ``missing`` or ``weak``.
     text : str
     photos : tuple of str
     next_step : str
@@ -179,6 +181,7 @@ def check_workspace(workspace: Path | str, *, integrity: bool = True) -> Workspa
         held = _held_photos(report, models[0]) if models else ()
         bridges = _bridges(report)
         findings = [
+            *(_photos(scene) if integrity else []),
             *_model(report, scene),
             *_verdict(report, scene),
             *sorted(
@@ -210,6 +213,27 @@ def _damaged(damage: Sequence[Damage]) -> WorkspaceCheck:
         num_photos=0, num_registered=0, grade=None, verdict="", photos=(), parts=(), bridges=(), missing=(),
         findings=findings,
     )  # fmt: skip
+
+
+def _photos(scene: Workspace) -> list[SceneFinding]:
+    """Photos that are no longer what was reconstructed; all that other tools get of the scene needs them."""
+    records = read_index(scene).records
+    missing, changed = photos_unlike(records, scene.images_dir, PhotoCache(scene.photo_cache))
+    again = command_again(scene, "images")
+    found = []
+    if len(missing) == len(records):
+        moved = scene.command_for("images", images_dir="NEWDIR")
+        text, step = f"the photos are no longer in {scene.images_dir}", f"put them back, or run: {moved}"
+        found.append(SceneFinding(kind="photos", text=text, photos=(), next_step=step))
+    elif missing:
+        text = f"photos that are no longer in {scene.images_dir}, or cannot be read: {first_few(missing)}"
+        step = f"put them back, or leave them out, with: {again}"
+        found.append(SceneFinding(kind="photos", text=text, photos=tuple(missing), next_step=step))
+    if changed:
+        text = f"photos that have changed since they were reconstructed: {first_few(changed)}"
+        step = f"put the earlier ones back, or run: {again}"
+        found.append(SceneFinding(kind="photos", text=text, photos=tuple(changed), next_step=step))
+    return found
 
 
 def _held_photos(report: SceneReport, model: pycolmap.Reconstruction) -> tuple[HeldPhoto, ...]:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from corrsfm.errors import InputError
 from corrsfm.files import atomic_write_json, read_json, sha256_of
 from corrsfm.images.cameras import PhotoInfo
 from corrsfm.images.photos import read_photo_info
+from corrsfm.types import ImageRecord
 
-__all__ = ["PhotoCache"]
+__all__ = ["PhotoCache", "photos_unlike"]
 
 
 class PhotoCache:
@@ -62,3 +64,31 @@ class PhotoCache:
     def save(self) -> None:
         """Write the cache with the photos asked for since construction, and no others."""
         atomic_write_json(self._path, self._kept)
+
+
+def photos_unlike(
+    records: Iterable[ImageRecord], folder: Path, cache: PhotoCache
+) -> tuple[list[str], list[str]]:
+    """Photos that are not the files that were indexed.
+
+    Parameters
+    ----------
+    records : iterable of ImageRecord
+    folder : Path
+        Of the photos.
+    cache : PhotoCache
+        Files that have not changed since it was written are not read.
+
+    Returns
+    -------
+    missing, changed : list of str
+        Names of photos that are not there, or cannot be read, and of those with another content.
+    """
+    missing, changed = [], []
+    for record in records:
+        try:
+            if cache.hash_of(folder / record.name) != record.sha256:
+                changed.append(record.name)
+        except InputError:
+            missing.append(record.name)
+    return missing, changed

@@ -113,6 +113,21 @@ def test_a_photo_of_another_size_is_refused(copied: FinishedScene, tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
+def test_a_photo_with_other_pixels_is_named_and_one_that_was_cut_is_refused(
+    copied: FinishedScene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = copied.photos / "2.png"
+    assert cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+    with caplog.at_level(logging.WARNING, "corrsfm"):
+        export_scene(copied.workspace, tmp_path / "out", "nerfstudio")
+    (warning,) = [record.getMessage() for record in caplog.records]
+    assert warning.startswith(f"changed since they were reconstructed: 2.png in {copied.photos};")
+    path.write_bytes(path.read_bytes()[:-300])
+    with pytest.raises(InputError, match=r"2\.png: is damaged, cut off"):
+        export_scene(copied.workspace, tmp_path / "cut", "nerfstudio")
+    assert not (tmp_path / "cut").exists()
+
+
 @pytest.mark.parametrize("content", [b"", b"no photo at all"])
 def test_a_photo_that_cannot_be_read_leaves_nothing_behind(
     copied: FinishedScene, tmp_path: Path, content: bytes

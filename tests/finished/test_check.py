@@ -67,6 +67,22 @@ def test_a_missing_photo_is_named_with_its_reason_and_a_command(scene: FinishedS
     assert "corrsfm" in finding.next_step and str(scene.workspace) in finding.next_step
 
 
+def test_photos_that_changed_or_went_away_are_named(scene: FinishedScene) -> None:
+    def said() -> list[tuple[tuple[str, ...], str]]:
+        found = check_workspace(scene.workspace).findings
+        return [(one.photos, one.next_step) for one in found if one.kind == "photos"]
+
+    assert not said()
+    (scene.photos / "1.png").write_bytes((scene.photos / "2.png").read_bytes())
+    (scene.photos / "3.png").unlink()
+    (gone, _), (changed, step) = said()
+    assert (gone, changed) == (("3.png",), ("1.png",))
+    assert step.startswith(f"put the earlier ones back, or run: corrsfm extract {scene.photos}")
+    scene.photos.rename(scene.photos.with_name("moved"))
+    ((photos, step),) = said()
+    assert not photos and f"corrsfm extract NEWDIR {scene.workspace}" in step
+
+
 def test_photos_are_listed_by_what_holds_them(scene: FinishedScene, monkeypatch: pytest.MonkeyPatch) -> None:
     a, b, c, d, e = scene.names
     pairs = [

@@ -14,6 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap
+from corrsfm.files import sha256_of
 from corrsfm.types import Features, ImageRecord, PairList
 from corrsfm.workspace import StageRecord, Workspace
 from corrsfm.workspace.items import PrunedMatches
@@ -119,7 +120,9 @@ def _write_lists(workspace: Workspace, model: pycolmap.Reconstruction, photos: P
     """Index, pairs, features and kept matches; keypoint k of each photo is that of the model."""
     images = sorted(model.images.values(), key=lambda image: image.name)
     camera = camera_from_pycolmap(next(iter(model.cameras.values())))
-    records = tuple(ImageRecord(name=image.name, camera_id=0, sha256="0") for image in images)
+    records = tuple(
+        ImageRecord(name=image.name, camera_id=0, sha256=sha256_of(photos / image.name)) for image in images
+    )
     write_index(workspace, Index(records=records, cameras=(camera,)))
     workspace.images_dir = photos
     names = [image.name for image in images]
