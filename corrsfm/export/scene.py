@@ -122,7 +122,7 @@ def export_scene(
         If the workspace has no current model, or the output cannot be written.
     """
     source, path, target = Workspace(Path(workspace)), Path(output), _target_of(target)
-    source.require("models")
+    _require_model(source, needs_features=target is ExportTarget.HLOC)
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
     index = read_index(source)
@@ -173,6 +173,20 @@ def export_scene(
         gps=fit,
         verdict=_verdict_of(source),
     )
+
+
+def _require_model(source: Workspace, *, needs_features: bool) -> None:
+    """Refuse a model that does not belong to the database; warn of one that photos have changed since."""
+    record = source.record_of("models")
+    made_from = record.inputs if record is not None else {}
+    held = {stage: one.fingerprint for stage in made_from if (one := source.record_of(stage)) is not None}
+    try:
+        source.require("models")
+    except WorkspaceError as error:
+        if record is None or held != made_from or needs_features:
+            raise
+        # A run that stopped at a bad photo must not take the finished model away.
+        logger.warning("%s; the model from before is exported", error)
 
 
 def _as_held(model: pycolmap.Reconstruction, photos: Path) -> list[Pose]:

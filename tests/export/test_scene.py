@@ -15,7 +15,7 @@ from corrsfm import export_scene
 from corrsfm.errors import DatabaseError, InputError, WorkspaceError
 from corrsfm.export import ExportTarget
 from corrsfm.export.photos import flat_names, is_undistortable
-from corrsfm.workspace import Workspace
+from corrsfm.workspace import StageRecord, Workspace
 
 
 def files_in(folder: Path) -> list[str]:
@@ -111,6 +111,25 @@ def test_a_photo_of_another_size_is_refused(copied: FinishedScene, tmp_path: Pat
         with pytest.raises(InputError, match="2.png"):
             export_scene(copied.workspace, tmp_path / "out", target)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_outlives_a_run_that_stopped_at_a_bad_photo(
+    copied: FinishedScene, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    workspace = Workspace(copied.workspace)
+    for stage, inputs in (("features", {}), ("verified matches", {"features": "f"})):
+        workspace.finish(stage, StageRecord(fingerprint=stage[0], inputs=inputs))
+    workspace.finish("models", StageRecord(fingerprint="m", inputs={"verified matches": "v"}))
+    workspace.forget("features")
+    with caplog.at_level(logging.WARNING, "corrsfm"):
+        export_scene(workspace.root, tmp_path / "poses.csv", "csv")
+    assert "no features yet; run: corrsfm extract" in caplog.text
+    assert "the model from before is exported" in caplog.text
+    with pytest.raises(WorkspaceError, match="no features yet"):
+        export_scene(workspace.root, tmp_path / "hloc", "hloc")
+    workspace.finish("verified matches", StageRecord(fingerprint="newer"))
+    with pytest.raises(WorkspaceError, match="models are older than verified matches"):
+        export_scene(workspace.root, tmp_path / "newer.csv", "csv")
 
 
 def test_a_photo_with_other_pixels_is_named_and_one_that_was_cut_is_refused(
