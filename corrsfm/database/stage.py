@@ -27,7 +27,7 @@ from corrsfm.machine import count_threads
 from corrsfm.types import Camera, Features, ImageRecord, Pair, check_indices
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.items import PrunedMatches
-from corrsfm.workspace.lists import Index, read_index, read_pairs
+from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish
 from corrsfm.workspace.stores import features_of, pruned_of
 from corrsfm.workspace.warned import keeps_warnings
@@ -63,6 +63,9 @@ def verify_matches(
     if not damaged:
         explain(workspace, "verified matches", config)
     workspace.forget("verified matches")
+    # Models that photos were added to name photos and cameras as their own database did.
+    if read_added(workspace):
+        workspace.forget("models")
     with (
         features_of(workspace).reader() as read_features,
         pruned_of(workspace).reader() as read_pruned,

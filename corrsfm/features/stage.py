@@ -22,6 +22,7 @@ from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import (
+    drop_foreign_record,
     imported_features,
     imported_from,
     traits_to_come,
@@ -54,6 +55,7 @@ def extract_features(
     """
     index = read_index(workspace)
     images = workspace.require("images")
+    drop_foreign_record(workspace, "features")
     store = features_of(workspace)
     if (source := imported_from(workspace, "features")) is not None:
         traits_to_come(workspace, config, cfg.MatchesConfig())

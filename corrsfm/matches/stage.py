@@ -11,7 +11,7 @@ from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.matches import create_matcher
 from corrsfm.types import Matches, Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.imported import imported_from, imported_matches, traits_with
+from corrsfm.workspace.imported import drop_foreign_record, imported_from, imported_matches, traits_with
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.shards import make_items
 from corrsfm.workspace.stores import features_of, matches_of
@@ -36,6 +36,7 @@ def match_pairs(
     kind = traits_with(workspace, config).features
     features = workspace.require("features")
     pairs = workspace.require("pairs")
+    drop_foreign_record(workspace, "matches")
     store = matches_of(workspace)
     inputs = {"features": features.fingerprint, "pairs": pairs.fingerprint}
     if (source := imported_from(workspace, "matches")) is not None:

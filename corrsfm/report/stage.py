@@ -41,6 +41,8 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
     """
     with collect_warnings() as met:
         summary, models = summarise(workspace)
+    if not workspace.added.exists():
+        workspace.forget_file("models", workspace.added)
     kept = read_warnings(workspace.warnings_json)
     stages = (BEFORE_STAGES, *STAGE_COMMANDS)
     said = [*((stage, kept.get(stage, [])) for stage in stages), ("report", met)]

@@ -64,7 +64,7 @@ _FILES = {
     "images": ("images.json", "images.txt"),
     "pairs": ("pairs.txt", "pair_origins.tsv"),
     "verified matches": ("cameras.json", "database.db"),
-    "models": ("evidence.json",),
+    "models": ("evidence.json", "added.json"),
 }
 
 
@@ -420,6 +420,12 @@ class Workspace:
         record = self.record_of(stage)
         wanted = record.files if record is not None else {}
         return [self.root / name for name, digest in wanted.items() if self._digest(name) != digest]
+
+    def forget_file(self, stage: str, path: Path) -> None:
+        """Take the loss of a file for granted that a stage wrote, and that cannot be made again."""
+        record = self._values["stages"].get(stage, {})
+        if record.get("files", {}).pop(path.name, None) is not None:
+            self._write()
 
     def forget(self, stage: str) -> None:
         """Drop the record of a stage, so that it is not taken for finished."""

@@ -11,7 +11,7 @@ import json
 from typing import Any
 
 from corrsfm import config as cfg
-from corrsfm.errors import ConfigError, WorkspaceError, first_few
+from corrsfm.errors import ConfigError, DamageError, WorkspaceError, first_few
 from corrsfm.types import Pair, PairList
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
@@ -19,6 +19,7 @@ from corrsfm.workspace.manifest import StageRecord
 from corrsfm.workspace.stores import features_of, matches_of
 
 __all__ = [
+    "drop_foreign_record",
     "fingerprint_of_imported",
     "imported_features",
     "imported_from",
@@ -41,15 +42,15 @@ def imported_from(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None
     WorkspaceError
         If an import was not finished.
     """
-    if (record := workspace.record_of(stage)) is None:
-        return _unrecorded(workspace, stage)
-    return _source(workspace, record.config) if "has_shapes" in record.config else None
-
-
-def _unrecorded(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
-    """Where the items of a stage without a record were imported from; pairs come with their matches."""
+    record = workspace.record_of(stage)
+    if record is not None and "has_shapes" in record.config:
+        return _source(workspace, record.config)
+    # The manifest may have been lost, or be that of another workspace.
     store = features_of(workspace) if stage == "features" else matches_of(workspace)
-    origin = store.origin()
+    try:
+        origin = store.origin()
+    except DamageError:
+        return None
     if origin is None:
         return None
     config = json.loads(origin)
@@ -61,6 +62,15 @@ def _unrecorded(workspace: Workspace, stage: str) -> cfg.ImportedConfig | None:
 
 def _source(workspace: Workspace, config: dict[str, Any]) -> cfg.ImportedConfig:
     return cfg.from_dict(cfg.ImportedConfig, config, str(workspace.manifest))
+
+
+def drop_foreign_record(workspace: Workspace, stage: str) -> None:
+    """Forget what a manifest says of a stage whose items were imported: it is that of another workspace."""
+    record = workspace.record_of(stage)
+    if record is None or "has_shapes" in record.config:
+        return
+    if imported_from(workspace, stage) is not None:
+        workspace.forget(stage)
 
 
 def is_unfinished_import(workspace: Workspace) -> bool:

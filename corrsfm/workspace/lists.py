@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
+import shlex
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -95,9 +96,10 @@ def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError) as error:
+        remedy = shlex.join(["rm", "-r", str(workspace.added)])
         raise WorkspaceError(
-            f"{workspace.added}: damaged ({error}); delete it: what it says of added photos is lost, the "
-            "models are not"
+            f"{workspace.added}: damaged ({error}); what it says of photos is lost, the models are not; "
+            f"run: {remedy}"
         ) from error
 
 

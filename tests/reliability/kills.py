@@ -226,6 +226,10 @@ def _tables(path: Path) -> dict[str, Any]:
                     "SELECT key, fingerprint, attributes, layout, data FROM items JOIN arrays USING (number)"
                 )
                 found[table] = sorted(map(repr, connection.execute(query)))
+            elif table == "about":
+                # The place of imported files is that of the test.
+                query = "SELECT name, value FROM about WHERE name != 'origin'"
+                found[table] = sorted(map(repr, connection.execute(query)))
             elif table not in ("arrays", "sqlite_sequence"):
                 found[table] = sorted(
                     map(repr, connection.execute(f"SELECT {', '.join(columns)} FROM {table}"))

@@ -18,7 +18,10 @@ CAMERA = "130,80,60"
 """Intrinsics of the photos, for --camera-model SIMPLE_PINHOLE."""
 
 _QUICK = ["--max-features", "200", "--threads", "1", "--device", "cpu"]
-SCENE_OPTIONS = ["--camera-model", "SIMPLE_PINHOLE", "--camera-params", CAMERA, *_QUICK]
+_CAMERAS = ["--camera-model", "SIMPLE_PINHOLE", "--camera-params", CAMERA]
+SCENE_OPTIONS = [*_CAMERAS, *_QUICK]
+# Matches of other tools carry no ratios, which the network reads; and features are not limited again.
+IMPORTED_OPTIONS = [*_CAMERAS, "--method", "loransac", "--threads", "1", "--device", "cpu"]
 
 
 @dataclass(frozen=True)
@@ -48,10 +51,30 @@ class Place:
         """A finished workspace of five photos, or of the first four, with the folder ``photos`` of them."""
         if not (self.work / "photos").exists():
             self.photos(photos)
-        shutil.copytree(self.base / ("scene" if photos == NUM_PHOTOS else "small_scene"), self.work / name)
+        return self._copy_of("scene" if photos == NUM_PHOTOS else "small_scene", name)
+
+    def imported_scene(self, name: str = "scene") -> Path:
+        """A finished workspace of features and matches that were imported from ``hloc``."""
+        self.photos(NUM_PHOTOS)
+        shutil.copytree(self.base / "hloc", self.work / "hloc")
+        return self._copy_of("imported_scene", name)
+
+    def grown_scene(self, name: str = "scene") -> Path:
+        """A finished workspace of four photos that a fifth was added to."""
+        self.photos(NUM_PHOTOS)
+        return self._copy_of("grown_scene", name)
+
+    def _copy_of(self, scene: str, name: str) -> Path:
+        """A copy of a workspace that knows its photos, and what it was imported from, in this place."""
+        shutil.copytree(self.base / scene, self.work / name)
+        from corrsfm.workspace.manifest import write_manifest
+
         manifest = self.work / name / "workspace.json"
-        text = manifest.read_text("utf-8").replace(str(self.base / "photos"), str(self.work / "photos"))
-        manifest.write_text(text, "utf-8")
+        text = manifest.read_text("utf-8")
+        for folder, here in (("grown_photos", "photos"), ("photos", "photos"), ("hloc", "hloc")):
+            text = text.replace(f'"{self.base / folder}', f'"{self.work / here}')
+        values = json.loads(text)
+        write_manifest(manifest, {key: value for key, value in values.items() if key != "checksum"})
         return self.work / name
 
     def model(self, name: str = "model") -> Path:
@@ -104,6 +127,8 @@ def make_base(folder: Path) -> None:
     first = [str(folder / "photos" / f"{number}.jpg") for number in range(NUM_PHOTOS - 1)]
     assert call(["-q", "run", *first, str(folder / "small_scene"), *SCENE_OPTIONS]) == 0
     assert json.loads((folder / "scene" / "report.json").read_text())["models"]
+    _make_imported(folder)
+    _make_grown(folder)
     names = [f"{number}.jpg" for number in range(3)]
     write_features(folder / "hloc_features.h5", names)
     write_matches(folder / "hloc_matches.h5", [("0.jpg", "1.jpg"), ("1.jpg", "2.jpg")])
@@ -112,3 +137,29 @@ def make_base(folder: Path) -> None:
     wall = cv2.imread(str(folder / "photos" / "0.jpg"))
     assert cv2.imwrite(str(folder / "wall.ppm"), wall)
     shutil.copy(CHECKPOINT_DIR / f"{DEFAULT_CHECKPOINT}.pt", folder / "net.pt")
+
+
+def _make_imported(folder: Path) -> None:
+    """A scene of what another was exported to."""
+    from sandbox import call
+
+    assert call(["-q", "export", str(folder / "scene"), str(folder / "hloc"), "--for", "hloc"]) == 0
+    photos, scene = str(folder / "photos"), str(folder / "imported_scene")
+    files = [f"--{name}={folder / 'hloc' / name}.h5" for name in ("features", "matches")]
+    assert call(["-q", "import", photos, scene, *files, "--kind", "sift", *_CAMERAS]) == 0
+    assert call(["-q", "run", photos, scene, *IMPORTED_OPTIONS]) == 0
+    assert json.loads((folder / "imported_scene" / "report.json").read_text())["models"]
+
+
+def _make_grown(folder: Path) -> None:
+    """A scene of four photos that a fifth was added to."""
+    from sandbox import call
+
+    for number in range(NUM_PHOTOS - 1):
+        (folder / "grown_photos").mkdir(exist_ok=True)
+        shutil.copy(folder / "photos" / f"{number}.jpg", folder / "grown_photos")
+    scene = str(folder / "grown_scene")
+    assert call(["-q", "run", str(folder / "grown_photos"), scene, *SCENE_OPTIONS]) == 0
+    new = str(folder / "photos" / f"{NUM_PHOTOS - 1}.jpg")
+    assert call(["-q", "add", scene, new, "--threads", "1", "--device", "cpu"]) == 0
+    assert json.loads((folder / "grown_scene" / "added.json").read_text())["photos"]["4.jpg"]["model"] == 0

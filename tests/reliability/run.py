@@ -123,15 +123,19 @@ class Trials:
 
     def damages(self, most: int | None) -> list[Row]:
         """Damage every file of a scene in every way, and follow the advice."""
-        found = [damage for damage in all_damages(self.base / "scene") if self._only in damage.name]
+        found = [damage for damage in all_damages(self.base) if self._only in damage.name]
         found = self._drawn(found, most)
-        expected = in_child(lambda: result_of(lay_out(self.base, self._root / "whole").work / "scene"))
+        expected = {
+            scene: in_child(lambda s=scene: _result_of_whole(self.base, self._root / f"whole {s}", s))
+            for scene in {damage.scene for damage in found}
+        }
 
         def work(job: int) -> Iterator[Row]:
             for number, damage in enumerate(found[job :: self._jobs]):
                 folder = self._root / f"damage-{job}-{number}"
                 rng = random.Random(f"{self._seed} {damage.name}")
-                yield in_child(lambda d=damage, f=folder, r=rng: try_damage(d, self.base, f, expected, r))
+                whole = expected[damage.scene]
+                yield in_child(lambda d=damage, f=folder, w=whole, r=rng: try_damage(d, self.base, f, w, r))
                 _remove(folder)
 
         return _side_by_side(work, self._root, self._jobs)
@@ -177,6 +181,11 @@ class Trials:
 
         # One at a time: each is run where its photos are.
         return _side_by_side(work, self._root, 1)
+
+
+def _result_of_whole(base: Path, folder: Path, scene: str) -> dict[str, Any]:
+    """What a scene holds that was not damaged."""
+    return result_of(lay_out(base, folder, scene).work / "scene")
 
 
 def _quietly(function: Callable[[], None]) -> None:

@@ -72,6 +72,7 @@ def preload() -> None:
     """Import everything once, before the first fork, and check that no thread runs that a fork would lose."""
     os.environ["TQDM_DISABLE"] = "1"
     import cv2  # noqa: I001  before pycolmap, see test_architecture.py
+    import click.formatting
     import torch
 
     import corrsfm.cli
@@ -92,6 +93,8 @@ def preload() -> None:
     import corrsfm.training.prepare
     import corrsfm.training.synthetic  # noqa: F401
 
+    # Needed for the first error, when a command without root's rights may not read the packages any more.
+    click.formatting.wrap_text("")
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     with contextlib.suppress(ImportError):
