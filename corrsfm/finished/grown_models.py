@@ -18,7 +18,7 @@ from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
-from corrsfm.reconstruction.calibration import adjustment_options
+from corrsfm.reconstruction.calibration import adjustment_options, restore_priors
 from corrsfm.reconstruction.growth import grow
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.resection import Resection
@@ -72,6 +72,8 @@ def grow_models(
         num = len(models_of(workspace))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True), 0
     models = models_of(workspace)
+    for model in models:
+        restore_priors(model, workspace.database)
     matches = read_verified_matches(workspace.database)
     index = read_index(workspace)
     known_focal = {

@@ -8,6 +8,8 @@ photos to judge by, avoids that.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ __all__ = [
     "is_plausible",
     "refine",
     "refine_intrinsics",
+    "restore_priors",
     "thinned",
 ]
 
@@ -185,3 +188,18 @@ def adjusted_cost(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjust
         return None
     # The type stubs know the base class of summaries only.
     return float(summary.ceres_summary.final_cost)  # type: ignore[attr-defined]
+
+
+def restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
+    """Tell cameras of a model which focal lengths were known before mapping; files of models do not say.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        Changed in place. Cameras that the database does not hold are copies of ones of unknown focal length.
+    database : Path
+    """
+    with pycolmap.Database.open(database) as tables:
+        has_prior = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
+    for camera_id, camera in model.cameras.items():
+        camera.has_prior_focal_length = has_prior.get(camera_id, False)

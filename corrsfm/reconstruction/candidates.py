@@ -22,7 +22,7 @@ from corrsfm.colmap.cameras import write_camera
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.errors import DatabaseError
-from corrsfm.reconstruction.calibration import has_possible_cameras, refine_intrinsics
+from corrsfm.reconstruction.calibration import has_possible_cameras, refine_intrinsics, restore_priors
 
 __all__ = [
     "Candidate",
@@ -175,7 +175,7 @@ def map_candidate(
         possible = [one for one in models.values() if has_possible_cameras(one)]
         model = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
         if model is not None and model.num_reg_images() > 1:
-            _restore_priors(model, own)
+            restore_priors(model, own)
             (workdir / "model").mkdir()
             model.write_binary(workdir / "model")
         else:
@@ -262,15 +262,6 @@ def change_cameras(database: Path, to: StartingCameras) -> None:
             frame.add_data_id(image.data_id)
             tables.update_frame(frame)
             tables.update_image(image)
-
-
-def _restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
-    """Give cameras back what is known about their focal length; what a candidate tried is not EXIF."""
-    with pycolmap.Database.open(database) as tables:
-        has_prior = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
-    for camera_id, camera in model.cameras.items():
-        # Only cameras of unknown focal length are copied.
-        camera.has_prior_focal_length = has_prior.get(camera_id, False)
 
 
 def _map(

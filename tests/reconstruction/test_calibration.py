@@ -18,6 +18,7 @@ from corrsfm.reconstruction.calibration import (
     has_prior_focal_lengths,
     is_plausible,
     refine_intrinsics,
+    restore_priors,
 )
 from corrsfm.reconstruction.mapper import reconstruct
 
@@ -44,6 +45,21 @@ def set_focal_length(model: pycolmap.Reconstruction, number: int, factor: float)
 @pytest.fixture
 def model(tmp_path: Path) -> pycolmap.Reconstruction:
     return synthesize(tmp_path / "database.db")
+
+
+def test_a_model_read_from_files_learns_which_focal_lengths_were_known(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        for camera in database.read_all_cameras()[:-1]:
+            camera.has_prior_focal_length = True
+            database.update_camera(camera)
+    (tmp_path / "model").mkdir()
+    model.write_binary(tmp_path / "model")
+    read = pycolmap.Reconstruction(tmp_path / "model")
+    assert len(focal_length_ratios(read)) == 10
+    restore_priors(read, tmp_path / "database.db")
+    assert len(focal_length_ratios(read)) == 1 and not has_prior_focal_lengths(read)
 
 
 def test_equal_cameras_are_plausible(model: pycolmap.Reconstruction) -> None:
