@@ -58,6 +58,7 @@ def find_damage(workspace: Workspace) -> list[Damage]:
     for stage, (path, read) in reader.stages().items():
         if workspace.record_of(stage) is None:
             continue
+        changed: list[Path] = []
         try:
             # Before pycolmap meets damaged bytes, with which it may not come to an end.
             if changed := workspace.changed_files(stage):
@@ -70,8 +71,17 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             problem = f"damaged ({type(error).__name__}: {error})"
         else:
             continue
-        if stage in _STORES and path.exists():
+        if workspace.adding.exists() and stage == "models":
+            remedy = shlex.join(["corrsfm", "add", str(workspace.root)])
+        elif changed == [workspace.added]:
+            # What it said is lost; the models are not.
+            removal = shlex.join(["rm", "-rf", str(workspace.added)])
+            remedy = f"{removal}; {shlex.join(['corrsfm', 'report', str(workspace.root)])}"
+        elif stage in _STORES and path.exists():
             remedy = command_again(workspace, stage, "--verify")
+        elif stage == "models":
+            # Models that photos were added to cannot be made again; it keeps a copy of them.
+            remedy = command_again(workspace, stage, "--overwrite")
         else:
             remedy = command_again(workspace, stage)
             if path.exists():

@@ -16,7 +16,7 @@ from corrsfm.pairs import strategies
 from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import drop_foreign_record, imported_from, record_imported_pairs
-from corrsfm.workspace.lists import Index, read_index, read_pairs, write_pairs
+from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
@@ -51,11 +51,15 @@ def make_pairs(
             "are needed; replace them and run again"
         )
     names = [record.name for record in records]
-    if not overwrite and workspace.is_current("pairs", fingerprint, workspace.pairs, workspace.pair_origins):
+    if not overwrite and workspace.is_current("pairs", fingerprint, workspace.pair_origins):
         pair_list = read_pairs(workspace)
+        if not workspace.is_current("pairs", fingerprint, workspace.pairs):
+            write_pairs(workspace, pair_list)
         _warn_if_disconnected(names, pair_list)
         return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
     explain(workspace, "pairs", config)
+    if read_added(workspace):
+        logger.warning("pairs: chosen again for all photos; those that corrsfm add chose are not kept")
     with features_of(workspace).reader() as read:
         # A list or a model may name photos that were left out.
         candidates = index.records if config.pairs_file or config.covisible_model else records

@@ -92,7 +92,10 @@ def read_index(workspace: Workspace) -> Index:
 def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
     """Photos that were put into finished models, and what is known of each; empty if there are none."""
     try:
-        return dict(read_json(workspace.added)["photos"])
+        photos = dict(read_json(workspace.added)["photos"])
+        if not all("model" in found for found in photos.values()):
+            raise ValueError("a photo without its model")
+        return photos
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, KeyError, TypeError) as error:
