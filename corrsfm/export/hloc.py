@@ -10,6 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.databases import copy_photos_of
+from corrsfm.colmap.models import write_model
 from corrsfm.files import atomic_write_text
 from corrsfm.types import Features, check_indices
 from corrsfm.workspace import Workspace
@@ -64,8 +65,7 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
             file[f"{pair_group(pair)}/matches0"] = matches
             file[f"{pair_group(pair)}/matching_scores0"] = scores
     atomic_write_text(folder / "pairs.txt", "".join(f"{name0} {name1}\n" for name0, name1 in pairs))
-    (folder / "sfm").mkdir()
-    model.write_binary(folder / "sfm")
+    write_model(model, folder / "sfm")
     copy_photos_of(workspace.database, folder / "sfm" / "database.db", names)
 
 

@@ -68,7 +68,6 @@ def reconstruct(
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
     _keep_grown_models(workspace)
-    workspace.forget("models")
     names = read_index(workspace).names
     if images_dir is None:
         fingerprint = black
@@ -78,7 +77,6 @@ def reconstruct(
             workspace.command_for("images", images_dir="NEWDIR"),
         )
     _warn_of_parts(workspace, names)
-    workspace.evidence.unlink(missing_ok=True)
     chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
     features = features_of(workspace)
     with (
@@ -98,12 +96,11 @@ def reconstruct(
                 on_progress=functools.partial(_show_progress, bar),
                 choose=choice if chooses else None,
                 join=choice.join if config.join_models else None,
+                before_replacing=lambda: _replace_evidence(workspace, choice.record),
             )
         except ReconstructionError:
             workspace.put_models_aside()
             raise
-    if choice.record is not None:
-        atomic_write_json(workspace.evidence, choice.record)
     for path in (workspace.added, workspace.adding):
         path.unlink(missing_ok=True)
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
@@ -114,6 +111,15 @@ def reconstruct(
 def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -> str:
     """What the record of the stage must carry to be current; ``verified`` is that of the verified matches."""
     return config_hash("models", pycolmap_version(), verified, config, seed)
+
+
+def _replace_evidence(workspace: Workspace, record: dict[str, Any] | None) -> None:
+    """Just before new models take the place of the old: until here, on a full disk say, those stay in use."""
+    if record is None:
+        workspace.forget("models")
+        workspace.evidence.unlink(missing_ok=True)
+    else:
+        atomic_write_json(workspace.evidence, record, before_replacing=lambda: workspace.forget("models"))
 
 
 def _keep_grown_models(workspace: Workspace) -> None:

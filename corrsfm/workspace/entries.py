@@ -12,13 +12,14 @@ import stat
 from collections.abc import Collection
 from pathlib import Path
 
+from corrsfm.disk import opening
 from corrsfm.errors import WorkspaceError
 
 __all__ = ["check_entries"]
 
 
 def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
-    """Refuse links, special files, and folders and files in each other's place, where a workspace writes.
+    """Refuse links, special files, what may not be read, and folders and files in each other's place.
 
     Parameters
     ----------
@@ -34,6 +35,8 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
     WorkspaceError
         Naming the first one.
     """
+    if not os.access(root, os.R_OK | os.X_OK):
+        raise WorkspaceError(opening(root))
     with os.scandir(root) as entries:
         for entry in entries:
             # Beside a database, SQLite keeps its log.
@@ -53,6 +56,8 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
                 )
             if stat.S_ISDIR(mode):
                 check_entries(Path(entry.path), (), may_link=may_link)
+            elif stat.S_ISREG(mode) and not os.access(entry.path, os.R_OK):
+                raise WorkspaceError(opening(Path(entry.path)))
             elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
                 raise WorkspaceError(
                     f"{entry.path}: is a pipe or device, expected a file; run: {_removal(entry.path)}"
