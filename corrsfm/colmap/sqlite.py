@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import marshal
 import shutil
@@ -10,11 +11,13 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from corrsfm.disk import explain
 from corrsfm.errors import DatabaseError
 
 __all__ = [
     "PAIR_BASE",
     "copy_database",
+    "copy_errors",
     "database_errors",
     "find_damage",
     "is_sqlite",
@@ -228,14 +231,27 @@ def copy_database(source: Path, target: Path) -> None:
     DatabaseError
         If the source cannot be read or the target not written.
     """
-    try:
-        with (
-            contextlib.closing(sqlite3.connect(source, timeout=60)) as old,
-            contextlib.closing(sqlite3.connect(target)) as new,
-        ):
+    # Not a byte of it is changed: it may lie on a read-only disk.
+    with open_for_reading(source) as old, copy_errors(source, target):
+        with contextlib.closing(sqlite3.connect(target)) as new:
             old.backup(new)
+
+
+@contextlib.contextmanager
+def copy_errors(source: Path, target: Path) -> Iterator[None]:
+    """Say what SQLite's errors mean while one database is written from another.
+
+    Raises
+    ------
+    DatabaseError
+        Naming the target if its disk is full, else the source.
+    """
+    try:
+        yield
     except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorname", "").startswith(("SQLITE_FULL", "SQLITE_IOERR")):
+            raise DatabaseError(explain(OSError(errno.ENOSPC, str(error)), target)) from error
         raise DatabaseError(
-            f"{source}: cannot be copied to {target.parent} ({error}); check the free space of the disk and "
-            "close other programs that use the file"
+            f"{source}: cannot be copied to {target.parent} ({error}); close other programs that use it, or "
+            "make it again with corrsfm prune --overwrite"
         ) from error

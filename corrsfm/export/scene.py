@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.colmap.models import poses_of
+from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.export import ExportTarget
 from corrsfm.export.colmap import write_colmap, write_colmap3
@@ -158,6 +159,8 @@ def export_scene(
                 temporary.mkdir()
             _writers(source, photos, upright or fit is not None)[target](model, temporary)
     except OSError as error:
+        if is_of_the_disk(error):
+            raise WorkspaceError(f"{explain(error, None if error.filename else path)}; nothing is left there") from error
         raise WorkspaceError(
             f"{path}: cannot be written ({error.strerror}); nothing is left there"
         ) from error

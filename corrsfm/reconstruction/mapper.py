@@ -17,6 +17,7 @@ from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import summarise_model, write_model
 from corrsfm.colmap.sqlite import database_errors
 from corrsfm.config import Mapper, ReconstructionConfig
+from corrsfm.disk import room_for
 from corrsfm.errors import DatabaseError, ReconstructionError
 from corrsfm.files import atomic_path
 from corrsfm.reconstruction.calibration import has_possible_cameras, is_plausible, refine_intrinsics
@@ -26,6 +27,7 @@ from corrsfm.types import ModelSummary
 __all__ = ["reconstruct", "threads_for"]
 
 _POLL_SECONDS = 0.2
+_LOG_BYTES = 1 << 17
 
 # With several threads, COLMAP's search for the first pair and its adjustment depend on which thread is ahead:
 # on the 20 photos of a validation scene the same seed gave models of 15 and of 20 photos. One thread is as
@@ -95,7 +97,13 @@ def reconstruct(
     """
     if not database.is_file():
         raise DatabaseError(f"{database}: no such database; try: corrsfm prune WORKSPACE")
-    with atomic_path(output, before_replacing=before_replacing) as temporary, colmap_log(log_file), database_errors(database):
+    with (
+        atomic_path(output, before_replacing=before_replacing) as temporary,
+        # Where pycolmap cannot make a log beside the database, it leaves half of one.
+        room_for(output.parent, _LOG_BYTES),
+        colmap_log(log_file),
+        database_errors(database),
+    ):
         graph = read_pair_graph(database)
         if not graph.num_inliers:
             raise ReconstructionError(f"{database}: {why_no_model(graph)}")

@@ -18,7 +18,7 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
-from corrsfm.errors import ReconstructionError, first_few
+from corrsfm.errors import CorrsfmError, ReconstructionError, first_few
 from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
@@ -172,19 +172,24 @@ class _Choice:
         for folder in workspace.candidates.glob("*"):
             if folder != self._workdir:
                 shutil.rmtree(folder)
-        selection = select_model(
-            first,
-            self._evidence,
-            workspace.database,
-            self._workdir,
-            policy=policy_for(self._config.max_models_tried, seconds),
-            first_seconds=seconds,
-            seed=run.seed,
-            cameras_on_trial=self._cameras_on_trial(),
-            refine_principal_point=self._config.refine_principal_point,
-            num_processes=count_threads(run.threads),
-            unfold=self._config.unfold,
-        )
+        try:
+            selection = select_model(
+                first,
+                self._evidence,
+                workspace.database,
+                self._workdir,
+                policy=policy_for(self._config.max_models_tried, seconds),
+                first_seconds=seconds,
+                seed=run.seed,
+                cameras_on_trial=self._cameras_on_trial(),
+                refine_principal_point=self._config.refine_principal_point,
+                num_processes=count_threads(run.threads),
+                unfold=self._config.unfold,
+            )
+        except (OSError, CorrsfmError):
+            # They must not hold on to what little space there is; only kills leave them, to go on from.
+            shutil.rmtree(workspace.candidates, ignore_errors=True)
+            raise
         self.record = None if selection is None else record_of(selection, self._evidence)
         if workspace.candidates.is_dir():
             shutil.rmtree(workspace.candidates)

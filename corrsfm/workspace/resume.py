@@ -124,8 +124,9 @@ def complete(
         discard_shards(workspace, store)
         return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
     explain(workspace, stage, config)
-    # From here on the store no longer holds what the record says.
-    workspace.forget(stage)
+    record = workspace.record_of(stage)
+    # The store of another method may be the one that the record is about.
+    holds_what_is_recorded = record is not None and store.seal() == record.fingerprint
     spent_on_items = 0.0
     try:
         if overwrite:
@@ -147,6 +148,10 @@ def complete(
                 now = time.monotonic()
                 if item is not None:
                     store.add(key, wanted[key], item, now - before)
+                if holds_what_is_recorded:
+                    # Not before something is in: where a full disk takes nothing, nothing is lost.
+                    workspace.forget(stage)
+                    holds_what_is_recorded = False
                 spent_on_items += now - before
                 before = now
                 bar.update()
