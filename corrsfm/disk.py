@@ -11,7 +11,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["explain", "is_of_the_disk", "opening", "room_for"]
+__all__ = ["explain", "is_of_the_disk", "opening", "require_room", "room_for"]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM)
@@ -107,22 +107,23 @@ def room_for(folder: Path, *sizes: int) -> Iterator[None]:
     OSError
         If there is no room.
     """
-    _set_aside(folder, sizes)
+    require_room(folder, *sizes)
     yield
-    _set_aside(folder, (_LAST_BYTES,))
+    require_room(folder, _LAST_BYTES)
 
 
-def _set_aside(folder: Path, sizes: tuple[int, ...]) -> None:
+def require_room(folder: Path, *sizes: int) -> None:
+    """Raise `OSError` unless there is room for files of these sizes, in bytes, in a folder."""
     with contextlib.ExitStack() as stack:
         for number, size in enumerate(sizes):
             scratch = folder / f".room.{number}.partial"
-            stack.callback(scratch.unlink, missing_ok=True)
-            handle = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
-            stack.callback(os.close, handle)
-            # macOS has no such call; there what was written is checked, and that is all.
-            if hasattr(os, "posix_fallocate"):
-                try:
+            try:
+                stack.callback(scratch.unlink, missing_ok=True)
+                handle = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
+                stack.callback(os.close, handle)
+                # macOS has no such call; there what was written is checked, and that is all.
+                if hasattr(os, "posix_fallocate"):
                     os.posix_fallocate(handle, 0, max(1, size))
-                except OSError as error:
-                    if error.errno not in _UNKNOWN:
-                        raise OSError(error.errno, error.strerror, str(folder)) from error
+            except OSError as error:
+                if error.errno not in _UNKNOWN:
+                    raise OSError(error.errno, error.strerror, str(folder)) from error

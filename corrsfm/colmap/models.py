@@ -171,12 +171,15 @@ def _sizes(model: pycolmap.Reconstruction, as_text: bool) -> list[int]:
 
 def _check_written(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Raise `ValueError` unless the binary files that matter hold all of a model."""
-    for name, number in (("images.bin", len(model.images)), ("points3D.bin", model.num_points3D())):
+    for name, number in (("images.bin", model.num_reg_images()), ("points3D.bin", model.num_points3D())):
         content = read_bytes(folder / name)
         if int.from_bytes(content[:8], "little") != number:
             raise ValueError(f"{name} does not hold {number} entries")
         _check_end(name, content, number)
-    for name, least in (("cameras.bin", model.num_cameras() * _CAMERA), ("frames.bin", model.num_frames() * _FRAME)):
+    for name, least in (
+        ("cameras.bin", model.num_cameras() * _CAMERA),
+        ("frames.bin", model.num_reg_frames() * _FRAME),
+    ):
         if (folder / name).stat().st_size < 8 + least:
             raise ValueError(f"{name} is too short")
 
@@ -184,7 +187,7 @@ def _check_written(model: pycolmap.Reconstruction, folder: Path) -> None:
 def _check_texts(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Raise `ValueError` unless the text files that matter hold all of a model."""
     for name, num_lines in (
-        ("images.txt", 2 * len(model.images)),
+        ("images.txt", 2 * model.num_reg_images()),
         ("points3D.txt", model.num_points3D()),
         ("cameras.txt", model.num_cameras()),
     ):

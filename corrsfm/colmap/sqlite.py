@@ -15,6 +15,7 @@ from corrsfm.disk import explain
 from corrsfm.errors import DatabaseError
 
 __all__ = [
+    "LOG_BYTES",
     "PAIR_BASE",
     "copy_database",
     "copy_errors",
@@ -30,6 +31,10 @@ __all__ = [
 
 PAIR_BASE = 2**31 - 1
 """COLMAP's id of a pair is this times the smaller image id plus the larger."""
+
+
+LOG_BYTES = 1 << 17
+"""Room for what SQLite puts beside a database that pycolmap opens; on a full disk half of it stays there."""
 
 
 def id_of_pair(image_id0: int, image_id1: int) -> int:

@@ -62,7 +62,6 @@ def verify_matches(
         )
     if not damaged:
         explain(workspace, "verified matches", config)
-    workspace.forget("verified matches")
     with (
         features_of(workspace).reader() as read_features,
         pruned_of(workspace).reader() as read_pruned,
@@ -70,7 +69,6 @@ def verify_matches(
         records, cameras, remarks = _decide_cameras(
             workspace, index, voting, read_features, read_pruned, pair_list.pairs, run.seed
         )
-        atomic_write_json(workspace.cameras_json, {"remarks": remarks})
         for remark in remarks:
             logger.info("%s", remark)
         features = workspace.require("features").fingerprint
@@ -83,6 +81,7 @@ def verify_matches(
             "seed": run.seed,
             "num_threads": count_threads(run.threads),
             "log_file": workspace.log,
+            "before_changing": lambda: workspace.forget("verified matches"),
         }
         num_changed = None
         if not (overwrite or damaged):
@@ -98,6 +97,7 @@ def verify_matches(
                 kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
                 **settings,
             )
+    atomic_write_json(workspace.cameras_json, {"remarks": remarks})
     outcome = StageOutcome(
         stage="verified matches",
         num_items=len(pair_list),

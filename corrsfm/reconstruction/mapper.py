@@ -15,7 +15,7 @@ import pycolmap
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import summarise_model, write_model
-from corrsfm.colmap.sqlite import database_errors
+from corrsfm.colmap.sqlite import LOG_BYTES, database_errors
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.disk import room_for
 from corrsfm.errors import DatabaseError, ReconstructionError
@@ -27,7 +27,6 @@ from corrsfm.types import ModelSummary
 __all__ = ["reconstruct", "threads_for"]
 
 _POLL_SECONDS = 0.2
-_LOG_BYTES = 1 << 17
 
 # With several threads, COLMAP's search for the first pair and its adjustment depend on which thread is ahead:
 # on the 20 photos of a validation scene the same seed gave models of 15 and of 20 photos. One thread is as
@@ -100,7 +99,7 @@ def reconstruct(
     with (
         atomic_path(output, before_replacing=before_replacing) as temporary,
         # Where pycolmap cannot make a log beside the database, it leaves half of one.
-        room_for(output.parent, _LOG_BYTES),
+        room_for(output.parent, LOG_BYTES),
         colmap_log(log_file),
         database_errors(database),
     ):
