@@ -11,7 +11,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["explain", "is_of_the_disk", "opening", "require_room", "room_for"]
+__all__ = ["explain", "is_closed", "is_of_the_disk", "opening", "require_room", "room_for"]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM)
@@ -51,6 +51,17 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
     if error.errno in _CLOSED:
         return opening(Path(os.fsdecode(named))) if named else f"{shown}: {error.strerror}"
     return f"{shown}: {error.strerror}"
+
+
+def is_closed(path: Path | str) -> bool:
+    """Whether something is at a path, or may be, that this user may not read."""
+    try:
+        os.stat(path)
+    except PermissionError:
+        return True
+    except (OSError, ValueError):
+        return False
+    return not os.access(path, os.R_OK)
 
 
 def opening(path: Path) -> str:

@@ -99,7 +99,7 @@ def _unfinished(path: Path) -> Path:
 
 def _unwritten(error: OSError, path: Path, advice: str = "") -> str:
     if is_of_the_disk(error):
-        return explain(error, None if error.filename else path)
+        return explain(error, path)
     return f"{path}: cannot be written ({error.strerror}){advice}"
 
 

@@ -6,12 +6,13 @@ import contextlib
 import errno
 import hashlib
 import marshal
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
-from corrsfm.disk import explain
+from corrsfm.disk import explain, opening
 from corrsfm.errors import DatabaseError
 
 __all__ = [
@@ -83,7 +84,7 @@ def _explain(path: Path, message: str) -> str | None:
     if "database is locked" in message:
         return _HELD
     if "readonly database" in message:
-        return "cannot be written; check the permissions of the file and its folder"
+        return _closed(path)
     if "No registered database factory" in message:
         return _explain_unopened(path)
     if "SQLite error" in message:
@@ -116,7 +117,13 @@ def _explain_unopened(path: Path) -> str:
             return _HELD
     except sqlite3.DatabaseError as error:
         return f"damaged ({error}); delete the file and make it again"
+    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        return _closed(path)
     return "cannot be opened; check the free space of the disk and the permissions of the file and its folder"
+
+
+def _closed(path: Path) -> str:
+    return opening(path).removeprefix(f"{path}: ")
 
 
 def is_sqlite(path: Path) -> bool:

@@ -123,6 +123,7 @@ def export_scene(
         If the workspace has no current model, or the output cannot be written.
     """
     source, path, target = Workspace(Path(workspace)), Path(output), _target_of(target)
+    source.check_readable()
     source.require("models")
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
@@ -160,7 +161,7 @@ def export_scene(
             _writers(source, photos, upright or fit is not None)[target](model, temporary)
     except OSError as error:
         if is_of_the_disk(error):
-            raise WorkspaceError(f"{explain(error, None if error.filename else path)}; nothing is left there") from error
+            raise WorkspaceError(f"{explain(error, path)}; nothing is left there") from error
         raise WorkspaceError(
             f"{path}: cannot be written ({error.strerror}); nothing is left there"
         ) from error

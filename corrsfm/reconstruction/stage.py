@@ -7,7 +7,7 @@ import logging
 import shlex
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,8 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
-from corrsfm.errors import CorrsfmError, ReconstructionError, first_few
+from corrsfm.disk import is_closed, opening
+from corrsfm.errors import CorrsfmError, InputError, ReconstructionError, first_few
 from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
@@ -69,6 +70,8 @@ def reconstruct(
     explain(workspace, "models", config)
     _keep_grown_models(workspace)
     names = read_index(workspace).names
+    if images_dir is not None:
+        _require_readable(images_dir, names)
     if images_dir is None:
         fingerprint = black
         logger.warning(
@@ -111,6 +114,13 @@ def reconstruct(
 def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -> str:
     """What the record of the stage must carry to be current; ``verified`` is that of the verified matches."""
     return config_hash("models", pycolmap_version(), verified, config, seed)
+
+
+def _require_readable(folder: Path, names: Iterable[str]) -> None:
+    """Refuse photos that may not be read: pycolmap would end with an error of its own, or leave points black."""
+    for path in (folder, *(folder / name for name in names)):
+        if is_closed(path):
+            raise InputError(opening(path))
 
 
 def _replace_evidence(workspace: Workspace, record: dict[str, Any] | None) -> None:

@@ -19,7 +19,7 @@ __all__ = ["check_entries"]
 
 
 def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
-    """Refuse links, special files, what may not be read, and folders and files in each other's place.
+    """Refuse links, special files, what may not be read or changed, and folders and files in each other's place.
 
     Parameters
     ----------
@@ -28,14 +28,15 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
         Names of files and folders in it; only files have a suffix. A folder is looked through. Empty for
         everything.
     may_link : bool
-        Whether links are fine, because nothing is written.
+        Whether links are fine, because nothing is written; else folders and databases must be writable too.
 
     Raises
     ------
     WorkspaceError
         Naming the first one.
     """
-    if not os.access(root, os.R_OK | os.X_OK):
+    writing = 0 if may_link else os.W_OK
+    if not os.access(root, os.R_OK | os.X_OK | writing):
         raise WorkspaceError(opening(root))
     with os.scandir(root) as entries:
         for entry in entries:
@@ -56,9 +57,12 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
                 )
             if stat.S_ISDIR(mode):
                 check_entries(Path(entry.path), (), may_link=may_link)
-            elif stat.S_ISREG(mode) and not os.access(entry.path, os.R_OK):
-                raise WorkspaceError(opening(Path(entry.path)))
-            elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+            elif stat.S_ISREG(mode):
+                # Other files are replaced, never changed.
+                in_place = writing if Path(entry.name).suffix == ".db" else 0
+                if not os.access(entry.path, os.R_OK | in_place):
+                    raise WorkspaceError(opening(Path(entry.path)))
+            elif not stat.S_ISLNK(mode):
                 raise WorkspaceError(
                     f"{entry.path}: is a pipe or device, expected a file; run: {_removal(entry.path)}"
                 )

@@ -13,6 +13,7 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+from corrsfm.disk import explain
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_write_json, atomic_write_text, read_json
 from corrsfm.types import Camera, ImageRecord, PairList
@@ -94,6 +95,8 @@ def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
         return dict(read_json(workspace.added)["photos"])
     except FileNotFoundError:
         return {}
+    except PermissionError as error:
+        raise WorkspaceError(explain(error)) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise WorkspaceError(
             f"{workspace.added}: damaged ({error}); delete it: what it says of added photos is lost, the "
