@@ -20,7 +20,7 @@ from corrsfm import config as cfg
 from corrsfm.cli.sections import SectionedOption, section_of
 from corrsfm.config.fields import flag_of
 from corrsfm.disk import is_closed, opening
-from corrsfm.errors import printable
+from corrsfm.errors import InputError, printable
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
 from corrsfm.files import why_unusable
 

@@ -122,8 +122,8 @@ def _check_end(name: str, content: bytes, num_entries: int) -> None:
         raise ValueError(f"{name} has {len(content)} bytes, and its entries {place}")
 
 
-# Bytes of an entry in binary: of a photo, an observation, a point, one of its views; at least those of a camera
-# and of a frame. As text a number takes up to 24.
+# Bytes of an entry in binary: of a photo, an observation, a point, one of its views; at least those of a
+# camera and of a frame. As text a number takes up to 24.
 _PHOTO, _OBSERVATION, _POINT, _VIEW, _CAMERA, _FRAME = 73, 24, 51, 8, 48, 64
 _TEXT_FACTOR = 4
 _EXTRA_BYTES = 1 << 13

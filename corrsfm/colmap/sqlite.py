@@ -244,9 +244,12 @@ def copy_database(source: Path, target: Path) -> None:
         If the source cannot be read or the target not written.
     """
     # Not a byte of it is changed: it may lie on a read-only disk.
-    with open_for_reading(source) as old, copy_errors(source, target):
-        with contextlib.closing(sqlite3.connect(target)) as new:
-            old.backup(new)
+    with (
+        open_for_reading(source) as old,
+        copy_errors(source, target),
+        contextlib.closing(sqlite3.connect(target)) as new,
+    ):
+        old.backup(new)
 
 
 @contextlib.contextmanager

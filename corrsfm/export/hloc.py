@@ -74,7 +74,7 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
 
 
 class _CarefulFile(io.FileIO):
-    """Keeps an error of the disk instead of raising it: HDF5, when it meets one as it closes, ends the process."""
+    """Keeps an error of the disk instead of raising it: met as it closes, HDF5 ends the process."""
 
     error: OSError | None = None
 

@@ -177,8 +177,8 @@ def _undistort_photo(photo: Path, camera: pycolmap.Camera, target: Path) -> None
         whole = pycolmap.Bitmap.read(photo, as_rgb=True)
         if whole is None or (whole.width, whole.height) != (camera.width, camera.height):
             raise InputError(
-                f"{photo}: COLMAP cannot read it, or it has another size; re-export it as JPEG or PNG, in the "
-                "size that was reconstructed"
+                f"{photo}: COLMAP cannot read it, or it has another size; re-export it as JPEG or PNG, in "
+                "the size that was reconstructed"
             )
         undistorted, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), whole, camera)
         _write_photo(undistorted, target)

@@ -117,7 +117,7 @@ def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -
 
 
 def _require_readable(folder: Path, names: Iterable[str]) -> None:
-    """Refuse photos that may not be read: pycolmap would end with an error of its own, or leave points black."""
+    """Refuse photos that may not be read: pycolmap ends with an error of its own, or leaves points black."""
     for path in (folder, *(folder / name for name in names)):
         if is_closed(path):
             raise InputError(opening(path))

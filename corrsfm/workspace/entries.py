@@ -19,7 +19,7 @@ __all__ = ["check_entries"]
 
 
 def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
-    """Refuse links, special files, what may not be read or changed, and folders and files in each other's place.
+    """Refuse links, special files, what is closed, and folders and files in each other's place.
 
     Parameters
     ----------

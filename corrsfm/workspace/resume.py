@@ -179,7 +179,7 @@ def complete(
 
 
 def _require_room(path: Path, share: float) -> None:
-    """Refuse to change a finished store where a share of it finds no room again: it would be lost half way."""
+    """Refuse to change a finished store where a share of it finds no room again."""
     try:
         require_room(path.parent, round(_ROOM_FACTOR * share * path.stat().st_size))
     except OSError as error:

@@ -148,6 +148,9 @@ def try_full_disk(disk: FullDisk, base: Path, folder: Path, expected: dict[str, 
                 faults.append("more than one line")
             if not writer.in_place:
                 now = _finished(work)
+                if disk.command == "prune":
+                    # Its first step may be through: the models are older than the matches then.
+                    now["stages"] = finished["stages"]
                 lost = sorted(name for name, what in finished.items() if now.get(name) != what)
                 faults += [f"lost or changed: {', '.join(lost[:5])}"] if lost else []
             outcome = run_command(words, folder)

@@ -16,7 +16,15 @@ from typing import Any
 from place import NUM_PHOTOS, SCENE_OPTIONS, Place
 from sandbox import Outcome, contents, leftovers, run_command
 
-__all__ = ["COMMANDS", "faults_after", "kill_command", "prepared", "result_of", "result_unhindered", "undisturbed"]
+__all__ = [
+    "COMMANDS",
+    "faults_after",
+    "kill_command",
+    "prepared",
+    "result_of",
+    "result_unhindered",
+    "undisturbed",
+]
 
 MOST_KILLS = 8
 _QUICK = ["--threads", "1", "--device", "cpu"]

@@ -31,7 +31,15 @@ MOST_ROUNDS = 4
 FILE_MODES, FOLDER_MODES = (0o000, 0o444, 0o200), (0o000, 0o555, 0o444)
 ALL = "everything"
 # These change nothing in the workspace.
-_READERS = ("check", "localize", "export splat", "export colmap", "export colmap3", "export hloc", "export ply")
+_READERS = (
+    "check",
+    "localize",
+    "export splat",
+    "export colmap",
+    "export colmap3",
+    "export hloc",
+    "export ply",
+)
 _CHMOD = re.compile(r"(?:with: )(chmod [^;,\n]+)")
 
 
@@ -88,7 +96,12 @@ def try_closed(closed: Closed, base: Path, folder: Path, expected: dict[str, Any
     trial = Trial(
         arguments=words,
         named=[Path(closed.place).name, "work"],
-        writes=[writer.makes, "scene/log.txt", "scene/.lock", *(["photos"] if closed.command == "add" else [])],
+        writes=[
+            writer.makes,
+            "scene/log.txt",
+            "scene/.lock",
+            *(["photos"] if closed.command == "add" else []),
+        ],
         expected=FINE if closed.place == ALL else EITHER,
         begins=True,
     )

@@ -1,6 +1,7 @@
 """Tries to break corrsfm: bad inputs, damages of a scene, kills, power cuts, full disks and permissions.
 
-python tests/reliability/run.py inputs damages kills cuts disks permissions --jobs 2 --results results/reliability.json
+python tests/reliability/run.py inputs damages kills cuts disks permissions --jobs 2 \\
+    --results results/reliability.json
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ COUNTED = {
     "damages": "the same, damage that changes results silently, advice that does not mend it",
     "kills": "finished work that is made again, another result than undisturbed, a file left",
     "disks": "no line that says so, a file lost, changed or left, another result once there is space",
-    "permissions": "no line that names the file, advice that does not open it, a file changed, another result",
+    "permissions": "no line that names the file, advice that does not help, a file changed, another result",
     "cuts": "work that was said to be finished and is lost, another result, a file left",
 }
 """What each attempt counts as a fault, for the table of results."""
@@ -190,7 +191,6 @@ class Trials:
         # One at a time: each is run where its photos are.
         return _side_by_side(work, self._root, 1)
 
-
     def disks(self, most: int | None) -> list[Row]:
         """Let the disk run full under commands, and run them again with space."""
         if why_not := why_no_mounts():
@@ -198,7 +198,9 @@ class Trials:
             return []
         found = self._drawn([disk for disk in all_full_disks() if self._only in disk.name], most)
         expected = {
-            name: in_child(lambda n=name: result_unhindered(WRITERS[n].prepare, self.base, self._root / f"u {n}"))
+            name: in_child(
+                lambda n=name: result_unhindered(WRITERS[n].prepare, self.base, self._root / f"u {n}")
+            )
             for name in dict.fromkeys(disk.command for disk in found)
         }
 
@@ -220,7 +222,9 @@ class Trials:
             [closed for closed in all_closed(self.base / "scene") if self._only in closed.name], most
         )
         expected = {
-            name: in_child(lambda n=name: result_unhindered(DOINGS[n].prepare, self.base, self._root / f"p {n}"))
+            name: in_child(
+                lambda n=name: result_unhindered(DOINGS[n].prepare, self.base, self._root / f"p {n}")
+            )
             for name in dict.fromkeys(closed.command for closed in found)
         }
 
