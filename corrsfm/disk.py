@@ -41,13 +41,13 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
     shown = _finished_name(place)
     if error.errno in _FULL:
         return (
-            f"{shown}: cannot be written, the disk is full ({str(error.strerror).lower()}); free some space there "
-            "and run the same command again"
+            f"{shown}: cannot be written, the disk is full ({str(error.strerror).lower()}); free some "
+            "space there and run the same command again"
         )
     if error.errno == errno.EFBIG:
         return (
-            f"{shown}: cannot be written, it is larger than files may be in this shell; raise the limit, with: "
-            "ulimit -f unlimited"
+            f"{shown}: cannot be written, it is larger than files may be in this shell; raise the limit, "
+            "with: ulimit -f unlimited"
         )
     if error.errno == errno.EROFS:
         return f"{shown}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
