@@ -70,6 +70,10 @@ def is_closed(path: Path | str) -> bool:
 def opening(path: Path) -> str:
     """What keeps a path from being read and written, perhaps a folder on the way, and what opens it."""
     closed, what, mode = _closed(path)
+    if mode == "w" and closed.exists() and os.statvfs(closed).f_flag & os.ST_RDONLY:
+        return (
+            f"{closed}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
+        )
     is_own = not closed.exists() or closed.stat().st_uid == os.geteuid()
     words = ["chmod", *(["-R"] if "X" in mode else []), f"{'u' if is_own else 'a'}+{mode}", str(closed)]
     if not is_own:

@@ -84,7 +84,9 @@ def _explain(path: Path, message: str) -> str | None:
     if "database is locked" in message:
         return _HELD
     if "readonly database" in message:
-        return _closed(path)
+        if not _is_writable(path):
+            return _closed(path)
+        return "cannot be written; check the permissions of the file and its folder"
     if "No registered database factory" in message:
         return _explain_unopened(path)
     if "SQLite error" in message:
@@ -117,9 +119,13 @@ def _explain_unopened(path: Path) -> str:
             return _HELD
     except sqlite3.DatabaseError as error:
         return f"damaged ({error}); delete the file and make it again"
-    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+    if not _is_writable(path):
         return _closed(path)
     return "cannot be opened; check the free space of the disk and the permissions of the file and its folder"
+
+
+def _is_writable(path: Path) -> bool:
+    return os.access(path.parent, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
 
 
 def _closed(path: Path) -> str:
