@@ -157,7 +157,8 @@ def _open(path: Path) -> FileIO:
         return FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+")
     except OSError as error:
         if is_of_the_disk(error):
-            raise WorkspaceError(f"{explain(error)}, or work on a copy of the folder") from error
+            copy = ", or work on a copy of the folder" if isinstance(error, PermissionError) else ""
+            raise WorkspaceError(f"{explain(error)}{copy}") from error
         raise WorkspaceError(
             f"{path.parent}: nothing can be written there ({error.strerror}); work on a copy of the folder"
         ) from error
