@@ -59,12 +59,12 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
 def is_closed(path: Path | str) -> bool:
     """Whether something is at a path, or may be, that this user may not read."""
     try:
-        os.stat(path)
+        is_folder = stat.S_ISDIR(os.stat(path).st_mode)
     except PermissionError:
         return True
     except (OSError, ValueError):
         return False
-    return not os.access(path, os.R_OK)
+    return not os.access(path, os.R_OK | (os.X_OK if is_folder else 0))
 
 
 def opening(path: Path) -> str:
