@@ -11,10 +11,11 @@ import os
 import shutil
 import stat
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import InputError, WorkspaceError
 
 __all__ = [
@@ -47,11 +48,17 @@ LARGEST_TEXT_BYTES = 1 << 28
 
 
 @contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path, *, before_replacing: Callable[[], None] = lambda: None) -> Iterator[Path]:
     """Yield a sibling path to write to; rename it to ``path`` on success, remove it on failure.
 
     Works for files and folders. A leftover of a killed process is removed first. When this returns, the file
     or everything in the folder is on the disk, and so is its name: a power cut leaves the old or the new.
+
+    Parameters
+    ----------
+    path : Path
+    before_replacing : callable, optional
+        Called when all is on the disk, just before it gets its name; what it raises leaves the old in place.
 
     Raises
     ------
@@ -63,9 +70,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         yield temporary
         try:
             if temporary.is_dir():
-                _replace_folder(temporary, path)
+                _replace_folder(temporary, path, before_replacing)
             else:
                 _sync(temporary)
+                before_replacing()
                 os.replace(temporary, path)
                 sync_folder(path.parent)
         except (IsADirectoryError, NotADirectoryError) as error:
@@ -85,8 +93,14 @@ def _unfinished(path: Path) -> Path:
         make_folder(path.parent)
         _remove(temporary)
     except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        raise WorkspaceError(_unwritten(error, path, "; choose another place")) from error
     return temporary
+
+
+def _unwritten(error: OSError, path: Path, advice: str = "") -> str:
+    if is_of_the_disk(error):
+        return explain(error, path)
+    return f"{path}: cannot be written ({error.strerror}){advice}"
 
 
 def make_folder(folder: Path) -> None:
@@ -119,11 +133,12 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _replace_folder(source: Path, target: Path) -> None:
+def _replace_folder(source: Path, target: Path, before_replacing: Callable[[], None]) -> None:
     """Put a folder in another's place; a kill in between leaves neither, never a mixture."""
     old = target.with_name(f".{target.name}.old")
     _remove(old)
     _sync_below(source)
+    before_replacing()
     if target.exists():
         os.replace(target, old)
     os.replace(source, target)
@@ -144,17 +159,23 @@ def atomic_write_text(path: Path, text: str) -> None:
 
 
 @contextlib.contextmanager
-def _writing(path: Path) -> Iterator[Path]:
+def _writing(path: Path, before_replacing: Callable[[], None] = lambda: None) -> Iterator[Path]:
     try:
-        with atomic_path(path) as temporary:
+        with atomic_path(path, before_replacing=before_replacing) as temporary:
             yield temporary
     except OSError as error:
-        raise WorkspaceError(f"{path}: cannot be written ({error.strerror})") from error
+        raise WorkspaceError(_unwritten(error, path)) from error
 
 
-def atomic_write_json(path: Path, value: Any) -> None:
-    """Write JSON whole or not at all."""
-    with _writing(path) as temporary, open(temporary, "w", encoding="utf-8") as stream:
+def atomic_write_json(path: Path, value: Any, *, before_replacing: Callable[[], None] = lambda: None) -> None:
+    """Write JSON whole or not at all; see `atomic_path`.
+
+    Raises
+    ------
+    WorkspaceError
+        If it cannot be written.
+    """
+    with _writing(path, before_replacing) as temporary, open(temporary, "w", encoding="utf-8") as stream:
         # Piece by piece: the report of a large scene is larger than all it is made from.
         json.dump(value, stream, indent=2, ensure_ascii=False, default=str)
         stream.write("\n")
@@ -215,6 +236,8 @@ def open_file(path: Path) -> io.BufferedReader:
         return _open_regular(path)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file") from error
+    except PermissionError as error:
+        raise InputError(explain(error)) from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 

@@ -22,6 +22,7 @@ from corrsfm.cli.importing import import_
 from corrsfm.cli.options import OVERWRITE_KEY
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.train import train
+from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import CorrsfmError, printable
 
 __all__ = ["main"]
@@ -54,6 +55,11 @@ class _Commands(click.Group):
             return super().invoke(ctx)
         except CorrsfmError as error:
             raise click.ClickException(printable(str(error))) from error
+        except OSError as error:
+            # A full disk or a closed folder may be met anywhere; other errors are faults of corrsfm.
+            if not is_of_the_disk(error):
+                raise
+            raise click.ClickException(printable(explain(error))) from error
         except KeyboardInterrupt as error:
             raise _Interruption(f"interrupted; {_how_to_go_on(ctx)}") from error
 

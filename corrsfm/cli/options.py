@@ -19,7 +19,8 @@ from click.core import ParameterSource
 from corrsfm import config as cfg
 from corrsfm.cli.sections import SectionedOption, section_of
 from corrsfm.config.fields import flag_of
-from corrsfm.errors import printable
+from corrsfm.disk import is_closed, opening
+from corrsfm.errors import InputError, printable
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
 from corrsfm.files import why_unusable
 
@@ -54,6 +55,8 @@ class _PathType(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         text = os.fspath(value)
+        if is_closed(text):
+            raise InputError(opening(Path(text)))
         if why := why_unusable(text):
             shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
             self.fail(f"'{printable(shown)}' {why}" if text else why, param, ctx)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
-from corrsfm.colmap.sqlite import PAIR_BASE, copy_database
-from corrsfm.errors import DatabaseError
+from corrsfm.colmap.sqlite import PAIR_BASE, copy_database, copy_errors
 
 __all__ = ["convert_to_3_8", "copy_photos_of"]
 
@@ -83,10 +82,8 @@ def copy_photos_of(source: Path, target: Path, names: Iterable[str]) -> None:
     DatabaseError
         If the source cannot be read or the target not written.
     """
-    if not source.exists():
-        raise DatabaseError(f"{source}: no such database; try: corrsfm prune WORKSPACE")
     copy_database(source, target)
-    with _errors(source), contextlib.closing(sqlite3.connect(target)) as database:
+    with copy_errors(source, target), contextlib.closing(sqlite3.connect(target)) as database:
         with database:
             database.execute("CREATE TABLE kept (image_id INTEGER PRIMARY KEY)")
             database.executemany(
@@ -113,7 +110,7 @@ def convert_to_3_8(source: Path, target: Path) -> None:
     DatabaseError
         If the source cannot be read or the target not written.
     """
-    with _errors(source), contextlib.closing(sqlite3.connect(target)) as database:
+    with copy_errors(source, target), contextlib.closing(sqlite3.connect(target)) as database:
         database.executescript(_SCHEMA_3_8)
         database.execute("ATTACH ? AS source", (str(source),))
         database.executescript(_FILL_3_8)
@@ -127,14 +124,3 @@ def convert_to_3_8(source: Path, target: Path) -> None:
                 "UPDATE main.images SET prior_tx = ?, prior_ty = ?, prior_tz = ? WHERE image_id = ?",
                 [(*struct.unpack("<3d", position), image_id) for position, image_id in priors],
             )
-
-
-@contextlib.contextmanager
-def _errors(source: Path) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise DatabaseError(
-            f"{source}: cannot be exported ({error}); make it again with corrsfm prune --overwrite, or free "
-            "some space on the disk"
-        ) from error

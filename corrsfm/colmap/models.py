@@ -1,7 +1,9 @@
-"""Finding COLMAP models, reading them and their poses, and summarising them in numbers."""
+"""Finding COLMAP models, reading and writing them, their poses, and summarising them in numbers."""
 
 from __future__ import annotations
 
+import errno
+import os
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
+from corrsfm.disk import room_for
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import read_bytes
 from corrsfm.geometry import Pose
@@ -24,6 +27,7 @@ __all__ = [
     "read_model",
     "read_models",
     "summarise_model",
+    "write_model",
 ]
 
 # Where a folder may keep its model: a workspace's first one, COLMAP's own habits.
@@ -116,6 +120,81 @@ def _check_end(name: str, content: bytes, num_entries: int) -> None:
         raise ValueError(f"{name} ends within an entry") from error
     if place != len(content):
         raise ValueError(f"{name} has {len(content)} bytes, and its entries {place}")
+
+
+# Bytes of an entry in binary: of a photo, an observation, a point, one of its views; at least those of a
+# camera and of a frame. As text a number takes up to 24.
+_PHOTO, _OBSERVATION, _POINT, _VIEW, _CAMERA, _FRAME = 73, 24, 51, 8, 48, 64
+_TEXT_FACTOR = 4
+_EXTRA_BYTES = 1 << 13
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path, *, as_text: bool = False) -> None:
+    """Write a model into a folder; pycolmap alone cuts it short on a full disk and says nothing.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    folder : Path
+        Is made where it is missing.
+    as_text : bool
+        COLMAP's text format instead of the binary one.
+
+    Raises
+    ------
+    OSError
+        If the disk is full, or nothing may be written there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with room_for(folder, *_sizes(model, as_text)):
+        (model.write_text if as_text else model.write_binary)(folder)
+    try:
+        (_check_texts if as_text else _check_written)(model, folder)
+    except (OSError, ValueError) as error:
+        raise OSError(errno.ENOSPC, f"what was written is not whole: {error}", str(folder)) from error
+
+
+def _sizes(model: pycolmap.Reconstruction, as_text: bool) -> list[int]:
+    """Bytes of each file of a model, at most."""
+    images, num_views = model.images.values(), model.compute_num_observations()
+    names = sum(len(os.fsencode(image.name)) for image in images)
+    num_keypoints = sum(image.num_points2D() for image in images)
+    sizes = [
+        names + len(images) * _PHOTO + num_keypoints * _OBSERVATION,
+        model.num_points3D() * _POINT + num_views * _VIEW,
+        model.num_cameras() * 4 * _CAMERA,
+        model.num_frames() * 2 * _FRAME,
+        model.num_rigs() * 2 * _FRAME,
+    ]
+    return [size * (_TEXT_FACTOR if as_text else 1) + _EXTRA_BYTES for size in sizes]
+
+
+def _check_written(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Raise `ValueError` unless the binary files that matter hold all of a model."""
+    for name, number in (("images.bin", model.num_reg_images()), ("points3D.bin", model.num_points3D())):
+        content = read_bytes(folder / name)
+        if int.from_bytes(content[:8], "little") != number:
+            raise ValueError(f"{name} does not hold {number} entries")
+        _check_end(name, content, number)
+    for name, least in (
+        ("cameras.bin", model.num_cameras() * _CAMERA),
+        ("frames.bin", model.num_reg_frames() * _FRAME),
+    ):
+        if (folder / name).stat().st_size < 8 + least:
+            raise ValueError(f"{name} is too short")
+
+
+def _check_texts(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Raise `ValueError` unless the text files that matter hold all of a model."""
+    for name, num_lines in (
+        ("images.txt", 2 * model.num_reg_images()),
+        ("points3D.txt", model.num_points3D()),
+        ("cameras.txt", model.num_cameras()),
+    ):
+        content = read_bytes(folder / name)
+        num = sum(not line.startswith(b"#") for line in content.splitlines())
+        if num < num_lines or not content.endswith(b"\n"):
+            raise ValueError(f"{name} ends too early")
 
 
 def poses_of(model: pycolmap.Reconstruction) -> dict[str, Pose]:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import marshal
+import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from corrsfm.disk import explain, opening
 from corrsfm.errors import DatabaseError
 
 __all__ = [
+    "LOG_BYTES",
     "PAIR_BASE",
     "copy_database",
+    "copy_errors",
     "database_errors",
     "find_damage",
     "is_sqlite",
@@ -27,6 +32,10 @@ __all__ = [
 
 PAIR_BASE = 2**31 - 1
 """COLMAP's id of a pair is this times the smaller image id plus the larger."""
+
+
+LOG_BYTES = 1 << 17
+"""Room for what SQLite puts beside a database that pycolmap opens; on a full disk half of it stays there."""
 
 
 def id_of_pair(image_id0: int, image_id1: int) -> int:
@@ -75,6 +84,8 @@ def _explain(path: Path, message: str) -> str | None:
     if "database is locked" in message:
         return _HELD
     if "readonly database" in message:
+        if not _is_writable(path):
+            return _closed(path)
         return "cannot be written; check the permissions of the file and its folder"
     if "No registered database factory" in message:
         return _explain_unopened(path)
@@ -108,7 +119,17 @@ def _explain_unopened(path: Path) -> str:
             return _HELD
     except sqlite3.DatabaseError as error:
         return f"damaged ({error}); delete the file and make it again"
+    if not _is_writable(path):
+        return _closed(path)
     return "cannot be opened; check the free space of the disk and the permissions of the file and its folder"
+
+
+def _is_writable(path: Path) -> bool:
+    return os.access(path.parent, os.W_OK) and (not path.exists() or os.access(path, os.W_OK))
+
+
+def _closed(path: Path) -> str:
+    return opening(path).removeprefix(f"{path}: ")
 
 
 def is_sqlite(path: Path) -> bool:
@@ -228,14 +249,30 @@ def copy_database(source: Path, target: Path) -> None:
     DatabaseError
         If the source cannot be read or the target not written.
     """
+    # Not a byte of it is changed: it may lie on a read-only disk.
+    with (
+        open_for_reading(source) as old,
+        copy_errors(source, target),
+        contextlib.closing(sqlite3.connect(target)) as new,
+    ):
+        old.backup(new)
+
+
+@contextlib.contextmanager
+def copy_errors(source: Path, target: Path) -> Iterator[None]:
+    """Say what SQLite's errors mean while one database is written from another.
+
+    Raises
+    ------
+    DatabaseError
+        Naming the target if its disk is full, else the source.
+    """
     try:
-        with (
-            contextlib.closing(sqlite3.connect(source, timeout=60)) as old,
-            contextlib.closing(sqlite3.connect(target)) as new,
-        ):
-            old.backup(new)
+        yield
     except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorname", "").startswith(("SQLITE_FULL", "SQLITE_IOERR")):
+            raise DatabaseError(explain(OSError(errno.ENOSPC, str(error)), target)) from error
         raise DatabaseError(
-            f"{source}: cannot be copied to {target.parent} ({error}); check the free space of the disk and "
-            "close other programs that use the file"
+            f"{source}: cannot be copied to {target.parent} ({error}); close other programs that use it, or "
+            "make it again with corrsfm prune --overwrite"
         ) from error

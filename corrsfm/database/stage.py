@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import heapq
 import logging
 import time
@@ -62,10 +63,6 @@ def verify_matches(
         )
     if not damaged:
         explain(workspace, "verified matches", config)
-    workspace.forget("verified matches")
-    # Models that photos were added to name photos and cameras as their own database did.
-    if read_added(workspace):
-        workspace.forget("models")
     with (
         features_of(workspace).reader() as read_features,
         pruned_of(workspace).reader() as read_pruned,
@@ -73,7 +70,6 @@ def verify_matches(
         records, cameras, remarks = _decide_cameras(
             workspace, index, voting, read_features, read_pruned, pair_list.pairs, run.seed
         )
-        atomic_write_json(workspace.cameras_json, {"remarks": remarks})
         for remark in remarks:
             logger.info("%s", remark)
         features = workspace.require("features").fingerprint
@@ -86,6 +82,7 @@ def verify_matches(
             "seed": run.seed,
             "num_threads": count_threads(run.threads),
             "log_file": workspace.log,
+            "before_changing": functools.partial(_forget, workspace),
         }
         num_changed = None
         if not (overwrite or damaged):
@@ -101,6 +98,7 @@ def verify_matches(
                 kept=((*pair, read_pruned(pair).indices) for pair in pair_list.pairs),
                 **settings,
             )
+    atomic_write_json(workspace.cameras_json, {"remarks": remarks})
     outcome = StageOutcome(
         stage="verified matches",
         num_items=len(pair_list),
@@ -109,6 +107,14 @@ def verify_matches(
     )
     finish(workspace, outcome, fingerprint, config, inputs={"pruned matches": pruned.fingerprint})
     return outcome
+
+
+def _forget(workspace: Workspace) -> None:
+    """From here on the database is another."""
+    workspace.forget("verified matches")
+    # Models that photos were added to name photos and cameras as their own database did.
+    if read_added(workspace):
+        workspace.forget("models")
 
 
 def _damage(path: Path, *, thorough: bool) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import camera_from_pycolmap, to_pycolmap, write_camera
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import copy_database, database_errors, id_of_pair, is_sqlite
+from corrsfm.colmap.sqlite import LOG_BYTES, copy_database, database_errors, id_of_pair, is_sqlite
 from corrsfm.config import DatabaseConfig
 from corrsfm.database.record import forget_pairs, image_ids, recorded_pairs, remember_pairs
 from corrsfm.database.verification import (
@@ -25,6 +25,7 @@ from corrsfm.database.verification import (
     verify_few_pairs,
     verify_pairs,
 )
+from corrsfm.disk import explain, require_room
 from corrsfm.errors import DatabaseError, InputError
 from corrsfm.files import atomic_path
 from corrsfm.types import Camera, Features, ImageRecord, Pair, check_indices
@@ -46,6 +47,7 @@ def write_database(
     seed: int = 0,
     num_threads: int = 0,
     log_file: Path | None = None,
+    before_changing: Callable[[], None] = lambda: None,
     base: str = "",
     fingerprints: Mapping[Pair, str] | None = None,
 ) -> None:
@@ -70,6 +72,8 @@ def write_database(
         Threads of the verification, on which results do not depend; 0 for all cores.
     log_file : Path, optional
         Where pycolmap's messages are appended.
+    before_changing : callable, optional
+        Called when the new database is on the disk, before it takes the place of the old one.
     base, fingerprints : str and mapping, optional
         What `update_database` will compare with: a fingerprint of all that is the same for every pair, and
         of the kept matches of each.
@@ -81,10 +85,9 @@ def write_database(
     DatabaseError
         If the database cannot be written, or the one to be replaced is in use.
     """
+    _require_room_for_logs(path)
     _check_not_in_use(path)
-    with atomic_path(path) as temporary:
-        for suffix in ("-wal", "-shm"):
-            temporary.with_name(temporary.name + suffix).unlink(missing_ok=True)
+    with _written_beside(path, before_changing) as temporary:
         with colmap_log(), database_errors(temporary, path):
             _fill(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
@@ -104,6 +107,7 @@ def update_database(
     seed: int = 0,
     num_threads: int = 0,
     log_file: Path | None = None,
+    before_changing: Callable[[], None] = lambda: None,
 ) -> int | None:
     """Write and verify the pairs of a database that changed, in place; it then equals one written anew.
 
@@ -118,6 +122,8 @@ def update_database(
         Pair → (K, 2) indices of its kept matches.
     cameras, config, seed, num_threads, log_file
         As for `write_database`.
+    before_changing : callable, optional
+        Called before the first change.
 
     Returns
     -------
@@ -132,6 +138,7 @@ def update_database(
     """
     if not path.is_file():
         return None
+    _require_room_for_logs(path)
     _check_not_in_use(path)
     recorded = recorded_pairs(path, base)
     if not recorded:
@@ -143,6 +150,7 @@ def update_database(
     changed = {number: pair for number, pair in wanted.items() if recorded.get(number) != fingerprints[pair]}
     if len(changed) > len(wanted) * MOST_CHANGED:
         return None
+    before_changing()
     forget_pairs(path, (recorded.keys() - wanted.keys()) | changed.keys())
     if changed:
         with colmap_log(), database_errors(path), _transaction(path) as database:
@@ -191,14 +199,36 @@ def add_to_database(
     DatabaseError
         If the database cannot be read or written, or is in use.
     """
+    _require_room_for_logs(path)
     _check_not_in_use(path)
-    with atomic_path(path) as temporary:
+    with _written_beside(path) as temporary:
         copy_database(path, temporary)
         with colmap_log(), database_errors(temporary, path):
             all_cameras = _append(temporary, images, cameras, features, kept, config.write_descriptors)
         with colmap_log(log_file), database_errors(temporary, path):
             # Pairs that were verified before have a geometry, and those are passed over.
             _verify(temporary, all_cameras, config, seed, num_threads)
+
+
+@contextlib.contextmanager
+def _written_beside(path: Path, before_replacing: Callable[[], None] = lambda: None) -> Iterator[Path]:
+    """Where a database is written that takes the place of another; no log of it stays, whatever happens."""
+    with atomic_path(path, before_replacing=before_replacing) as temporary:
+        logs = [temporary.with_name(temporary.name + suffix) for suffix in ("-wal", "-shm", "-journal")]
+        try:
+            for log in logs:
+                log.unlink(missing_ok=True)
+            yield temporary
+        finally:
+            for log in logs:
+                log.unlink(missing_ok=True)
+
+
+def _require_room_for_logs(path: Path) -> None:
+    try:
+        require_room(path.parent, LOG_BYTES)
+    except OSError as error:
+        raise DatabaseError(explain(error, path)) from error
 
 
 def _verify(

@@ -7,6 +7,7 @@ from pathlib import Path
 import pycolmap
 
 from corrsfm.colmap.databases import convert_to_3_8, copy_photos_of
+from corrsfm.colmap.models import write_model
 from corrsfm.errors import InputError
 from corrsfm.export.photos import copy_photos
 from corrsfm.files import atomic_write_text
@@ -18,8 +19,7 @@ _NEWEST_MODEL_OF_3_8 = 10
 
 def write_three_files(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write ``cameras.bin``, ``images.bin`` and ``points3D.bin`` alone: what readers of every age know."""
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
+    write_model(model, folder)
     for name in ("rigs.bin", "frames.bin"):
         (folder / name).unlink()
 
@@ -28,9 +28,8 @@ def write_colmap(model: pycolmap.Reconstruction, images_dir: Path, database: Pat
     """``images``, ``image_list.txt``, ``database.db``, ``sparse/0`` in binary and ``sparse_text/0``."""
     names = _write_photos(model, images_dir, folder)
     copy_photos_of(database, folder / "database.db", names)
-    for write, place in ((model.write_binary, "sparse"), (model.write_text, "sparse_text")):
-        (folder / place / "0").mkdir(parents=True)
-        write(folder / place / "0")
+    write_model(model, folder / "sparse" / "0")
+    write_model(model, folder / "sparse_text" / "0", as_text=True)
 
 
 def write_colmap3(model: pycolmap.Reconstruction, images_dir: Path, database: Path, folder: Path) -> None:

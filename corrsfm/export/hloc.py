@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -10,6 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.databases import copy_photos_of
+from corrsfm.colmap.models import write_model
 from corrsfm.files import atomic_write_text
 from corrsfm.types import Features, check_indices
 from corrsfm.workspace import Workspace
@@ -42,18 +47,18 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
     num_keypoints = {}
     with (
         features_of(workspace).reader() as read,
-        h5py.File(folder / "features.h5", "w") as file,
+        _writing(folder / "features.h5") as put,
     ):
         for name in names:
             features = read(name)
             num_keypoints[name] = len(features.keypoints)
             for key, value in _arrays(features).items():
-                file[f"{name}/{key}"] = value
+                put(f"{name}/{key}", value)
     held = set(names)
     pairs = [pair for pair in read_pairs(workspace).pairs if held >= set(pair)]
     with (
         pruned_of(workspace).reader() as read_kept,
-        h5py.File(folder / "matches.h5", "w") as file,
+        _writing(folder / "matches.h5") as put,
     ):
         for pair in pairs:
             kept, num = read_kept(pair), num_keypoints[pair[0]]
@@ -61,12 +66,50 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
             matches, scores = np.full(num, -1, np.int32), np.zeros(num, np.float32)
             matches[kept.indices[:, 0]] = kept.indices[:, 1]
             scores[kept.indices[:, 0]] = kept.scores
-            file[f"{pair_group(pair)}/matches0"] = matches
-            file[f"{pair_group(pair)}/matching_scores0"] = scores
+            put(f"{pair_group(pair)}/matches0", matches)
+            put(f"{pair_group(pair)}/matching_scores0", scores)
     atomic_write_text(folder / "pairs.txt", "".join(f"{name0} {name1}\n" for name0, name1 in pairs))
-    (folder / "sfm").mkdir()
-    model.write_binary(folder / "sfm")
+    write_model(model, folder / "sfm")
     copy_photos_of(workspace.database, folder / "sfm" / "database.db", names)
+
+
+class _CarefulFile(io.FileIO):
+    """Keeps an error of the disk instead of raising it: met as it closes, HDF5 ends the process."""
+
+    error: OSError | None = None
+
+    def flush(self) -> None:
+        """Nothing is held back; HDF5 looks for this on the class itself."""
+
+    def write(self, content: Any, /) -> int:
+        """Write all of it, unless something was lost before."""
+        left = memoryview(content).cast("B")
+        size = left.nbytes
+        try:
+            while left and self.error is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.error = error
+        return size
+
+    def check(self) -> None:
+        """Raise the first error of writing, if there was one."""
+        if self.error is not None:
+            raise self.error
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[Callable[[str, NDArray], None]]:
+    """A function that puts an array under a name into a new HDF5 file."""
+    with _CarefulFile(path, "w+") as raw:
+        with h5py.File(raw, "w") as file:
+
+            def put(name: str, values: NDArray) -> None:
+                file[name] = values
+                raw.check()
+
+            yield put
+        raw.check()
 
 
 def _arrays(features: Features) -> dict[str, NDArray]:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from corrsfm.colmap.models import poses_of
+from corrsfm.colmap.models import poses_of, write_model
 from corrsfm.errors import InputError
 from corrsfm.export.photos import undistort
 
@@ -22,8 +22,7 @@ _FLIP = np.array([1.0, -1.0, -1.0])
 def write_openmvs(model: pycolmap.Reconstruction, images_dir: Path, folder: Path) -> None:
     """``images`` and ``sparse`` as text with PINHOLE cameras, which InterfaceCOLMAP reads."""
     pinhole = undistort(model, images_dir, folder)
-    (folder / "sparse").mkdir()
-    pinhole.write_text(folder / "sparse")
+    write_model(pinhole, folder / "sparse", as_text=True)
     for name in ("rigs.txt", "frames.txt"):
         (folder / "sparse" / name).unlink()
 

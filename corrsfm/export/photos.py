@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import stat
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
+from corrsfm.disk import room_for
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.images.photos import read_image, read_photo_info
@@ -29,6 +31,8 @@ __all__ = [
 logger = logging.getLogger("corrsfm")
 
 _JPEG_QUALITY = 95
+# More than any format takes of three channels, with what else may be in the file.
+_BYTES_OF_PIXEL, _EXTRA_BYTES = 4, 1 << 17
 _NUM_BORDER_SAMPLES = 33
 _LARGEST_RETURN_ERROR_PX = 0.5
 
@@ -84,7 +88,13 @@ def copy_photos(names: Iterable[str], images_dir: Path, folder: Path) -> None:
     for name in names:
         target = folder / name
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(images_dir / name, target)
+        _copy(images_dir / name, target)
+
+
+def _copy(photo: Path, target: Path) -> None:
+    shutil.copy2(photo, target)
+    # The photos may be read-only; what is exported is the user's to change.
+    target.chmod(target.stat().st_mode | stat.S_IWUSR)
 
 
 def is_undistortable(camera: pycolmap.Camera) -> bool:
@@ -137,36 +147,65 @@ def undistort(model: pycolmap.Reconstruction, images_dir: Path, folder: Path) ->
                 "pinhole camera can show, or its distortion folds over; --for colmap keeps cameras as they "
                 "are, and --for nerfstudio keeps fisheyes"
             )
-    source, scratch = folder / ".distorted", folder / ".undistorted"
-    source.mkdir()
-    model.write_binary(source)
-    names = sorted(image.name for image in model.images.values())
-    try:
-        with colmap_log():
-            pycolmap.undistort_images(scratch, source, images_dir, jpeg_quality=_JPEG_QUALITY)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{images_dir}: the photos cannot be undistorted ({error})") from error
-    unwritten = [name for name in names if not (scratch / "images" / name).is_file()]
-    if unwritten:
-        raise InputError(
-            f"{images_dir}: COLMAP cannot undistort {first_few(unwritten)}; re-export these photos as JPEG "
-            "or PNG, in the size that was reconstructed"
-        )
-    pinhole = pycolmap.Reconstruction(scratch / "sparse")
-    for camera in pinhole.cameras.values():
-        _as_pinhole(camera)
-    (scratch / "images").rename(folder / "images")
-    shutil.rmtree(source)
-    shutil.rmtree(scratch)
+    cameras = {number: _pinhole_of(camera) for number, camera in model.cameras.items()}
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        target = folder / "images" / image.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _undistort_photo(images_dir / image.name, model.cameras[image.camera_id], target)
+    pinhole = pycolmap.Reconstruction(model)
+    for image in pinhole.images.values():
+        before, after = model.cameras[image.camera_id], cameras[image.camera_id]
+        if image.points2D and not before.is_undistorted():
+            rays = np.asarray(before.cam_from_img(np.array([point.xy for point in image.points2D])))
+            moved = np.asarray(after.img_from_cam(np.column_stack([rays, np.ones(len(rays))])))
+            for point, xy in zip(image.points2D, moved, strict=True):
+                # A keypoint where the distortion has no inverse stays where it is, as in COLMAP.
+                if np.isfinite(xy).all():
+                    point.xy = xy
+    for number, camera in pinhole.cameras.items():
+        camera.model = cameras[number].model
+        camera.width, camera.height = cameras[number].width, cameras[number].height
+        camera.params = cameras[number].params
     return pinhole
 
 
-def _as_pinhole(camera: pycolmap.Camera) -> None:
-    """COLMAP leaves SIMPLE_PINHOLE as it is; OpenMVS reads PINHOLE only."""
-    if camera.model_name == "SIMPLE_PINHOLE":
-        focal, cx, cy = camera.params
-        camera.model = pycolmap.CameraModelId.PINHOLE
-        camera.params = [focal, focal, cx, cy]
+def _pinhole_of(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """The PINHOLE camera of undistorted photos."""
+    if not camera.is_undistorted():
+        return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
+    pinhole = pycolmap.Camera(camera.todict())
+    if pinhole.model_name == "SIMPLE_PINHOLE":
+        # OpenMVS reads PINHOLE only.
+        focal, cx, cy = pinhole.params
+        pinhole.model = pycolmap.CameraModelId.PINHOLE
+        pinhole.params = [focal, focal, cx, cy]
+    return pinhole
+
+
+def _undistort_photo(photo: Path, camera: pycolmap.Camera, target: Path) -> None:
+    """Write one undistorted photo; one without distortion is copied."""
+    if camera.is_undistorted():
+        _copy(photo, target)
+        return
+    with colmap_log():
+        whole = pycolmap.Bitmap.read(photo, as_rgb=True)
+        if whole is None or (whole.width, whole.height) != (camera.width, camera.height):
+            raise InputError(
+                f"{photo}: COLMAP cannot read it, or it has another size; re-export it as JPEG or PNG, in "
+                "the size that was reconstructed"
+            )
+        undistorted, _ = pycolmap.undistort_image(pycolmap.UndistortCameraOptions(), whole, camera)
+        _write_photo(undistorted, target)
+
+
+def _write_photo(photo: pycolmap.Bitmap, path: Path) -> None:
+    """Write a photo in the format of its name."""
+    photo.set_jpeg_quality(_JPEG_QUALITY)
+    # On a full disk the JPEG library ends the process, and that of PNG says nothing.
+    with room_for(path.parent, photo.width * photo.height * _BYTES_OF_PIXEL + _EXTRA_BYTES), colmap_log():
+        is_written = photo.write(path, delinearize_colorspace=False)
+    if not is_written:
+        raise InputError(f"{path}: cannot be written in this format; re-export the photo as JPEG or PNG")
 
 
 def crop_to_principal_point(model: pycolmap.Reconstruction, images_dir: Path) -> None:
@@ -205,13 +244,10 @@ def crop_to_principal_point(model: pycolmap.Reconstruction, images_dir: Path) ->
 
 def _crop_photo(path: Path, start: NDArray[np.int64], end: NDArray[np.int64]) -> None:
     whole = pycolmap.Bitmap.read(path, as_rgb=True)
-    if whole is not None:
-        pixels = whole.to_array()[start[1] : end[1], start[0] : end[0]]
-        cropped = pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels))
-        cropped.set_jpeg_quality(_JPEG_QUALITY)
-        if cropped.write(path, delinearize_colorspace=False):
-            return
-    raise InputError(f"{path}: cannot be cropped; free some space on the disk")
+    if whole is None:
+        raise InputError(f"{path}: cannot be cropped; re-export the photo as JPEG or PNG")
+    pixels = whole.to_array()[start[1] : end[1], start[0] : end[0]]
+    _write_photo(pycolmap.Bitmap.from_array(np.ascontiguousarray(pixels)), path)
 
 
 def flat_names(names: Iterable[str]) -> dict[str, str]:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.colmap.models import poses_of
+from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.export import ExportTarget
 from corrsfm.export.colmap import write_colmap, write_colmap3
@@ -122,6 +123,7 @@ def export_scene(
         If the workspace has no current model, or the output cannot be written.
     """
     source, path, target = Workspace(Path(workspace)), Path(output), _target_of(target)
+    source.check_readable()
     _require_model(source, needs_features=target is ExportTarget.HLOC)
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
@@ -158,6 +160,8 @@ def export_scene(
                 temporary.mkdir()
             _writers(source, photos, upright or fit is not None)[target](model, temporary)
     except OSError as error:
+        if is_of_the_disk(error):
+            raise WorkspaceError(f"{explain(error, path)}; nothing is left there") from error
         raise WorkspaceError(
             f"{path}: cannot be written ({error.strerror}); nothing is left there"
         ) from error

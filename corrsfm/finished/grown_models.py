@@ -14,6 +14,7 @@ import pycolmap
 
 from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.models import write_model
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
@@ -138,8 +139,7 @@ def _write(
     atomic_write_json(workspace.added, {"photos": {**before, **record}})
     with atomic_path(workspace.sparse) as temporary:
         for number, model in enumerate(models):
-            (temporary / str(number)).mkdir(parents=True)
-            model.write_binary(temporary / str(number))
+            write_model(model, temporary / str(number))
     if workspace.evidence.exists():
         _judge(workspace, models[0], seed)
 

@@ -20,6 +20,7 @@ import pycolmap
 
 from corrsfm.colmap.cameras import write_camera
 from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.errors import DatabaseError
 from corrsfm.reconstruction.calibration import has_possible_cameras, refine_intrinsics, restore_priors
@@ -176,8 +177,7 @@ def map_candidate(
         model = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
         if model is not None and model.num_reg_images() > 1:
             restore_priors(model, own)
-            (workdir / "model").mkdir()
-            model.write_binary(workdir / "model")
+            write_model(model, workdir / "model")
         else:
             model = None
     shutil.rmtree(scratch)

@@ -14,9 +14,10 @@ from typing import Any
 import pycolmap
 
 from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.models import summarise_model
-from corrsfm.colmap.sqlite import database_errors
+from corrsfm.colmap.models import summarise_model, write_model
+from corrsfm.colmap.sqlite import LOG_BYTES, database_errors
 from corrsfm.config import Mapper, ReconstructionConfig
+from corrsfm.disk import room_for
 from corrsfm.errors import DatabaseError, ReconstructionError
 from corrsfm.files import atomic_path
 from corrsfm.reconstruction.calibration import has_possible_cameras, is_plausible, refine_intrinsics
@@ -47,6 +48,7 @@ def reconstruct(
     on_progress: Callable[[int], None] | None = None,
     choose: Callable[[pycolmap.Reconstruction | None, float], pycolmap.Reconstruction | None] | None = None,
     join: Callable[[list[pycolmap.Reconstruction]], list[pycolmap.Reconstruction]] | None = None,
+    before_replacing: Callable[[], None] = lambda: None,
 ) -> list[ModelSummary]:
     """Map a database into models; they appear at ``output`` all at once or not at all.
 
@@ -76,6 +78,9 @@ def reconstruct(
     join : callable, optional
         Given all models if there are several, the largest first: those to keep. Not asked if the time limit
         stopped mapping.
+    before_replacing : callable, optional
+        Called when the models are on the disk, before they take the place of what is there; what it raises
+        leaves that as it is.
 
     Returns
     -------
@@ -91,7 +96,13 @@ def reconstruct(
     """
     if not database.is_file():
         raise DatabaseError(f"{database}: no such database; try: corrsfm prune WORKSPACE")
-    with atomic_path(output) as temporary, colmap_log(log_file), database_errors(database):
+    with (
+        atomic_path(output, before_replacing=before_replacing) as temporary,
+        # Where pycolmap cannot make a log beside the database, it leaves half of one.
+        room_for(output.parent, LOG_BYTES),
+        colmap_log(log_file),
+        database_errors(database),
+    ):
         graph = read_pair_graph(database)
         if not graph.num_inliers:
             raise ReconstructionError(f"{database}: {why_no_model(graph)}")
@@ -126,8 +137,7 @@ def reconstruct(
             has_colours = config.mapper is Mapper.INCREMENTAL and (number or chosen is first)
             if images_dir is not None and not has_colours:
                 model.extract_colors_for_all_images(images_dir)
-            (temporary / str(number)).mkdir()
-            model.write_binary(temporary / str(number))
+            write_model(model, temporary / str(number))
         shutil.rmtree(scratch)
         return [summarise_model(model) for model in models]
 

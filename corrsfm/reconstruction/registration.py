@@ -13,6 +13,7 @@ from pathlib import Path
 import pycolmap
 
 from corrsfm.colmap.log import colmap_log
+from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import database_errors
 from corrsfm.reconstruction.candidates import Candidate, MapperKind, incremental_options
 
@@ -66,7 +67,7 @@ def register_again(
     given, found = workdir / "given", workdir / "found"
     for folder in (given, found):
         folder.mkdir(parents=True)
-    rest.write_binary(given)
+    write_model(rest, given)
     candidate = Candidate(mapper=MapperKind.RELAXED, seed=seed)
     options = incremental_options(candidate, refine_principal_point, num_threads)
     with colmap_log(), database_errors(database):

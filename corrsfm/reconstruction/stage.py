@@ -7,7 +7,7 @@ import logging
 import shlex
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,8 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import pycolmap_version
 from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
-from corrsfm.errors import ReconstructionError, first_few
+from corrsfm.disk import is_closed, opening
+from corrsfm.errors import CorrsfmError, InputError, ReconstructionError, first_few
 from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.machine import count_threads
@@ -68,8 +69,9 @@ def reconstruct(
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
     _keep_grown_models(workspace)
-    workspace.forget("models")
     names = read_index(workspace).names
+    if images_dir is not None:
+        _require_readable(images_dir, names)
     if images_dir is None:
         fingerprint = black
         logger.warning(
@@ -78,7 +80,6 @@ def reconstruct(
             workspace.command_for("images", images_dir="NEWDIR"),
         )
     _warn_of_parts(workspace, names)
-    workspace.evidence.unlink(missing_ok=True)
     chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
     features = features_of(workspace)
     with (
@@ -98,12 +99,11 @@ def reconstruct(
                 on_progress=functools.partial(_show_progress, bar),
                 choose=choice if chooses else None,
                 join=choice.join if config.join_models else None,
+                before_replacing=lambda: _replace_evidence(workspace, choice.record),
             )
         except ReconstructionError:
             workspace.put_models_aside()
             raise
-    if choice.record is not None:
-        atomic_write_json(workspace.evidence, choice.record)
     for path in (workspace.added, workspace.adding):
         path.unlink(missing_ok=True)
     outcome = StageOutcome(stage="models", num_items=len(models), seconds=time.monotonic() - started)
@@ -116,6 +116,22 @@ def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -
     return config_hash("models", pycolmap_version(), verified, config, seed)
 
 
+def _require_readable(folder: Path, names: Iterable[str]) -> None:
+    """Refuse photos that may not be read: pycolmap ends with an error of its own, or leaves points black."""
+    for path in (folder, *(folder / name for name in names)):
+        if is_closed(path):
+            raise InputError(opening(path))
+
+
+def _replace_evidence(workspace: Workspace, record: dict[str, Any] | None) -> None:
+    """Just before new models take the place of the old: until here, on a full disk say, those stay in use."""
+    if record is None:
+        workspace.forget("models")
+        workspace.evidence.unlink(missing_ok=True)
+    else:
+        atomic_write_json(workspace.evidence, record, before_replacing=lambda: workspace.forget("models"))
+
+
 def _keep_grown_models(workspace: Workspace) -> None:
     """Before all is mapped again: say what that means for photos that were added, and keep a copy."""
     if workspace.adding.exists():
@@ -125,16 +141,19 @@ def _keep_grown_models(workspace: Workspace) -> None:
             shlex.quote(str(workspace.root)),
         )
     added = read_added(workspace)
-    if not added or not workspace.sparse.is_dir():
+    if not added:
         return
-    with atomic_path(workspace.root / "sparse.old") as copy:
-        shutil.copytree(workspace.sparse, copy)
+    kept = "there are no models to keep"
+    if workspace.sparse.is_dir():
+        with atomic_path(workspace.root / "sparse.old") as copy:
+            shutil.copytree(workspace.sparse, copy)
+        kept = f"the models so far are kept in {workspace.root / 'sparse.old'}"
     logger.warning(
         "photos added to the models without moving the others: %d (%s); all photos are mapped again "
-        "now and every pose moves; the models so far are kept in %s",
+        "now and every pose moves; %s",
         len(added),
         first_few(added),
-        workspace.root / "sparse.old",
+        kept,
     )
 
 
@@ -166,19 +185,24 @@ class _Choice:
         for folder in workspace.candidates.glob("*"):
             if folder != self._workdir:
                 shutil.rmtree(folder)
-        selection = select_model(
-            first,
-            self._evidence,
-            workspace.database,
-            self._workdir,
-            policy=policy_for(self._config.max_models_tried, seconds),
-            first_seconds=seconds,
-            seed=run.seed,
-            cameras_on_trial=self._cameras_on_trial(),
-            refine_principal_point=self._config.refine_principal_point,
-            num_processes=count_threads(run.threads),
-            unfold=self._config.unfold,
-        )
+        try:
+            selection = select_model(
+                first,
+                self._evidence,
+                workspace.database,
+                self._workdir,
+                policy=policy_for(self._config.max_models_tried, seconds),
+                first_seconds=seconds,
+                seed=run.seed,
+                cameras_on_trial=self._cameras_on_trial(),
+                refine_principal_point=self._config.refine_principal_point,
+                num_processes=count_threads(run.threads),
+                unfold=self._config.unfold,
+            )
+        except (OSError, CorrsfmError):
+            # They must not hold on to what little space there is; only kills leave them, to go on from.
+            shutil.rmtree(workspace.candidates, ignore_errors=True)
+            raise
         self.record = None if selection is None else record_of(selection, self._evidence)
         if workspace.candidates.is_dir():
             shutil.rmtree(workspace.candidates)

@@ -12,13 +12,14 @@ import stat
 from collections.abc import Collection
 from pathlib import Path
 
+from corrsfm.disk import opening
 from corrsfm.errors import WorkspaceError
 
 __all__ = ["check_entries"]
 
 
 def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
-    """Refuse links, special files, and folders and files in each other's place, where a workspace writes.
+    """Refuse links, special files, what is closed, and folders and files in each other's place.
 
     Parameters
     ----------
@@ -27,13 +28,16 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
         Names of files and folders in it; only files have a suffix. A folder is looked through. Empty for
         everything.
     may_link : bool
-        Whether links are fine, because nothing is written.
+        Whether links are fine, because nothing is written; else folders and databases must be writable too.
 
     Raises
     ------
     WorkspaceError
         Naming the first one.
     """
+    writing = 0 if may_link else os.W_OK
+    if not os.access(root, os.R_OK | os.X_OK | writing):
+        raise WorkspaceError(opening(root))
     with os.scandir(root) as entries:
         for entry in entries:
             # Beside a database, SQLite keeps its log.
@@ -53,7 +57,12 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
                 )
             if stat.S_ISDIR(mode):
                 check_entries(Path(entry.path), (), may_link=may_link)
-            elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+            elif stat.S_ISREG(mode):
+                # Other files are replaced, never changed.
+                in_place = writing if Path(entry.name).suffix == ".db" else 0
+                if not os.access(entry.path, os.R_OK | in_place):
+                    raise WorkspaceError(opening(Path(entry.path)))
+            elif not stat.S_ISLNK(mode):
                 raise WorkspaceError(
                     f"{entry.path}: is a pipe or device, expected a file; run: {_removal(entry.path)}"
                 )

@@ -49,6 +49,7 @@ from typing import Any
 
 from corrsfm import config as cfg
 from corrsfm.colmap.sqlite import rows_digest
+from corrsfm.disk import explain
 from corrsfm.errors import ConfigError, InputError, WorkspaceError
 from corrsfm.files import FRAME_TIMES, OWN_RECORD, read_bytes, sha256_of
 from corrsfm.workspace.commands import command_for, label_of
@@ -245,6 +246,16 @@ class Workspace:
             self._values = read_manifest(self.manifest)
             yield
 
+    def check_readable(self) -> None:
+        """Make sure that everything may be read, before a library meets what may not.
+
+        Raises
+        ------
+        WorkspaceError
+            Naming what may not, and the command that changes that.
+        """
+        check_entries(self.root, self._own_names, may_link=True)
+
     @property
     def _own_names(self) -> list[str]:
         """Names of what is written in the root, but for the copies of photos, which are links by design."""
@@ -314,12 +325,17 @@ class Workspace:
 
         Raises
         ------
+        WorkspaceError
+            If it may not be read.
         OSError
             If it cannot be read.
         ValueError
             If it is not what the stage wrote.
         """
-        content = read_bytes(path)
+        try:
+            content = read_bytes(path)
+        except PermissionError as error:
+            raise WorkspaceError(explain(error)) from error
         record = self.record_of(stage)
         wanted = record.files.get(path.name) if record is not None else None
         if wanted is not None and hashlib.sha256(content).hexdigest() != wanted:

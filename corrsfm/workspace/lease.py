@@ -26,6 +26,7 @@ from dataclasses import asdict, dataclass
 from io import FileIO
 from pathlib import Path
 
+from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import WorkspaceError
 
 __all__ = ["BEAT_SECONDS", "LEASE_SECONDS", "hold"]
@@ -155,9 +156,11 @@ def _open(path: Path) -> FileIO:
         # A link in its place could lead to any file.
         return FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+")
     except OSError as error:
+        if is_of_the_disk(error):
+            copy = ", or work on a copy of the folder" if isinstance(error, PermissionError) else ""
+            raise WorkspaceError(f"{explain(error)}{copy}") from error
         raise WorkspaceError(
-            f"{path.parent}: nothing can be written there ({error.strerror}); check the permissions, or work "
-            "on a copy of the folder"
+            f"{path.parent}: nothing can be written there ({error.strerror}); work on a copy of the folder"
         ) from error
 
 

@@ -14,6 +14,7 @@ import sys
 from dataclasses import dataclass
 from typing import Any
 
+from corrsfm.disk import explain
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_write_json, atomic_write_text, read_json
 from corrsfm.types import Camera, ImageRecord, PairList
@@ -98,6 +99,8 @@ def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
         return photos
     except FileNotFoundError:
         return {}
+    except PermissionError as error:
+        raise WorkspaceError(explain(error)) from error
     except (OSError, ValueError, KeyError, TypeError) as error:
         remedy = shlex.join(["rm", "-r", str(workspace.added)])
         raise WorkspaceError(

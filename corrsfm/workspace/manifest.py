@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from corrsfm.disk import explain
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import atomic_write_json, read_json
 
@@ -77,7 +78,7 @@ def read_manifest(path: Path) -> dict[str, Any]:
             if values.pop("checksum", wanted := _checksum(values)) != wanted:
                 raise ValueError("not as it was written")
     except PermissionError as error:
-        raise WorkspaceError(f"{path}: may not be read; check its permissions") from error
+        raise WorkspaceError(explain(error)) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
         raise WorkspaceError(

@@ -10,11 +10,14 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from tqdm import tqdm
 
 from corrsfm import config as cfg
+from corrsfm.disk import explain as explain_error
+from corrsfm.disk import require_room
 from corrsfm.errors import CorrsfmError, DamageError, WorkspaceError
 from corrsfm.types import Pair
 from corrsfm.workspace.commands import label_of
@@ -40,6 +43,8 @@ __all__ = [
 logger = logging.getLogger("corrsfm")
 
 _LEFT_OUT = "left out"
+# What is written anew lies in the log first, beside what it replaces.
+_ROOM_FACTOR = 3
 _MATCHER_VERSIONS = {cfg.Matcher.NEAREST: "matches-1", cfg.Matcher.LIGHTGLUE: "lightglue-1"}
 
 K = TypeVar("K")
@@ -124,8 +129,14 @@ def complete(
         discard_shards(workspace, store)
         return StageOutcome(stage=stage, num_items=len(wanted), num_reused=len(wanted), skipped=True)
     explain(workspace, stage, config)
-    # From here on the store no longer holds what the record says.
-    workspace.forget(stage)
+    record = workspace.record_of(stage)
+    if overwrite:
+        workspace.forget(stage)
+        record = None
+    # The store of another method may be the one that the record is about.
+    holds_what_is_recorded = record is not None and store.seal() == record.fingerprint
+    if holds_what_is_recorded and missing:
+        _require_room(store.path, len(missing) / len(wanted))
     spent_on_items = 0.0
     try:
         if overwrite:
@@ -148,6 +159,10 @@ def complete(
                 now = time.monotonic()
                 if item is not None:
                     store.add(key, wanted[key], item, now - before)
+                if holds_what_is_recorded:
+                    # Not before something is in: where a full disk takes nothing, nothing is lost.
+                    workspace.forget(stage)
+                    holds_what_is_recorded = False
                 spent_on_items += now - before
                 before = now
                 bar.update()
@@ -165,6 +180,14 @@ def complete(
     cost = seconds_of_items + outcome.seconds - spent_on_items
     finish(workspace, outcome, fingerprint, config, inputs=inputs, cost=cost)
     return outcome
+
+
+def _require_room(path: Path, share: float) -> None:
+    """Refuse to change a finished store where a share of it finds no room again."""
+    try:
+        require_room(path.parent, round(_ROOM_FACTOR * share * path.stat().st_size))
+    except OSError as error:
+        raise WorkspaceError(f"{explain_error(error, path)}; nothing was changed") from error
 
 
 def _finished(store: ItemStore[K, T], wanted: Mapping[K, str], fingerprint: str, *, verify: bool) -> Set[K]:

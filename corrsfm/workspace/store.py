@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from pathlib import Path
 from typing import Any, Generic
 
+from corrsfm.disk import opening
 from corrsfm.errors import DamageError, InputError, WorkspaceError, first_few
 from corrsfm.files import atomic_path, sync_folder
 from corrsfm.workspace.items import Arrays, Attributes, K, Kind, T
@@ -315,8 +316,13 @@ class ItemStore(Generic[K, T]):
             name = getattr(error, "sqlite_errorname", "")
             for beginnings, text in _NOT_DAMAGE.items():
                 if name.startswith(beginnings):
+                    if "permissions" in text and self._is_closed():
+                        raise WorkspaceError(opening(self.path)) from error
                     raise WorkspaceError(f"{self.path}: {text.format(error)}") from error
             raise self._damaged(error) from error
+
+    def _is_closed(self) -> bool:
+        return not all(os.access(path, os.R_OK | os.W_OK) for path in (self.path, self.path.parent))
 
     def _damaged(self, what: object) -> DamageError:
         return DamageError(f"{self.path}: damaged ({what}); run: {self._mend}")

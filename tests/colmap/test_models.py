@@ -1,12 +1,17 @@
-"""Reading models that somebody else wrote."""
+"""Reading models that somebody else wrote, and writing them whole."""
 
+import contextlib
+import errno
+import resource
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2  # noqa: F401  (before pycolmap)
 import pycolmap
 import pytest
 
-from corrsfm.colmap.models import read_model
+from corrsfm.colmap import models
+from corrsfm.colmap.models import read_model, write_model
 from corrsfm.errors import InputError
 
 
@@ -35,3 +40,46 @@ def test_files_that_end_elsewhere_than_their_entries_are_refused(model: Path, na
         (model / name).write_bytes(content)
         with pytest.raises(InputError, match="cannot be read"):
             read_model(model)
+
+
+@pytest.mark.parametrize("as_text", [False, True])
+def test_a_model_is_written_as_pycolmap_does(model: Path, tmp_path: Path, as_text: bool) -> None:
+    given, plain = read_model(model), tmp_path / "plain"
+    plain.mkdir()
+    (given.write_text if as_text else given.write_binary)(plain)
+    write_model(given, tmp_path / "a" / "b", as_text=as_text)
+    assert {path.name: path.read_bytes() for path in (tmp_path / "a" / "b").iterdir()} == {
+        path.name: path.read_bytes() for path in plain.iterdir()
+    }
+
+
+def test_photos_without_a_pose_are_not_missed(model: Path, tmp_path: Path) -> None:
+    given = read_model(model)
+    given.deregister_frame(next(iter(given.frames)))
+    write_model(given, tmp_path / "out")
+    assert read_model(tmp_path / "out").num_reg_images() == 3
+
+
+@contextlib.contextmanager
+def files_of_at_most(num_bytes: int) -> Iterator[None]:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("as_text", [False, True])
+def test_a_model_that_finds_no_room_is_refused_and_one_cut_short_is_noticed(
+    model: Path, tmp_path: Path, as_text: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = read_model(model)
+    with files_of_at_most(1 << 11), pytest.raises(OSError) as refused:
+        write_model(given, tmp_path / "out", as_text=as_text)
+    assert refused.value.errno == errno.EFBIG and not list((tmp_path / "out").iterdir())
+    # Another program takes the room in between.
+    monkeypatch.setattr(models, "room_for", lambda *_: contextlib.nullcontext())
+    with files_of_at_most(1 << 11), pytest.raises(OSError, match="not whole") as cut:
+        write_model(given, tmp_path / "out", as_text=as_text)
+    assert cut.value.errno == errno.ENOSPC

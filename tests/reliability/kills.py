@@ -16,7 +16,15 @@ from typing import Any
 from place import NUM_PHOTOS, SCENE_OPTIONS, Place
 from sandbox import Outcome, contents, leftovers, run_command
 
-__all__ = ["COMMANDS", "faults_after", "kill_command", "prepared", "result_of", "undisturbed"]
+__all__ = [
+    "COMMANDS",
+    "faults_after",
+    "kill_command",
+    "prepared",
+    "result_of",
+    "result_unhindered",
+    "undisturbed",
+]
 
 MOST_KILLS = 8
 _QUICK = ["--threads", "1", "--device", "cpu"]
@@ -85,6 +93,13 @@ def undisturbed(name: str, base: Path, folder: Path) -> tuple[dict[str, Any], fl
     outcome = run_command(words, folder)
     assert outcome.code == 0, outcome.err
     return result_of(folder / "work"), outcome.seconds
+
+
+def result_unhindered(prepare: Callable[[Place], list[str]], base: Path, folder: Path) -> dict[str, Any]:
+    """What a command leaves that nothing hinders, by what lays out its working directory."""
+    outcome = run_command(prepare(_place(base, folder)), folder)
+    assert outcome.code == 0, outcome.err + outcome.out
+    return result_of(folder / "work")
 
 
 def kill_command(

@@ -1,6 +1,7 @@
-"""Tries to break corrsfm: bad inputs, damages of a scene, kills and power cuts.
+"""Tries to break corrsfm: bad inputs, damages of a scene, kills, power cuts, full disks and permissions.
 
-python tests/reliability/run.py inputs damages kills cuts --jobs 2 --results results/reliability.json
+python tests/reliability/run.py inputs damages kills cuts disks permissions --jobs 2 \\
+    --results results/reliability.json
 """
 
 from __future__ import annotations
@@ -35,7 +36,17 @@ import bad_paths  # noqa: E402
 import bad_photos  # noqa: E402
 from case import Case, Trial, find_faults  # noqa: E402
 from damages import all_damages, lay_out, try_damage  # noqa: E402
-from kills import COMMANDS, faults_after, kill_command, prepared, result_of, undisturbed  # noqa: E402
+from full_disks import WRITERS, all_full_disks, try_full_disk, why_no_mounts  # noqa: E402
+from kills import (  # noqa: E402
+    COMMANDS,
+    faults_after,
+    kill_command,
+    prepared,
+    result_of,
+    result_unhindered,
+    undisturbed,
+)
+from permissions import DOINGS, all_closed, try_closed, why_no_users  # noqa: E402
 from place import Place, make_base  # noqa: E402
 from power_cuts import record_cuts  # noqa: E402
 from sandbox import contents, fork, in_child, preload, run_command  # noqa: E402
@@ -46,12 +57,14 @@ COUNTED = {
     "inputs": "traceback, crash, hang, over 2.5 GB, no line that names the cause, a file left or changed",
     "damages": "the same, damage that changes results silently, advice that does not mend it",
     "kills": "finished work that is made again, another result than undisturbed, a file left",
+    "disks": "no line that says so, a file lost, changed or left, another result once there is space",
+    "permissions": "no line that names the file, advice that does not help, a file changed, another result",
     "cuts": "work that was said to be finished and is lost, another result, a file left",
 }
 """What each attempt counts as a fault, for the table of results."""
 NAMES = {
     "inputs": "bad inputs", "damages": "damages of a scene", "kills": "kills at random moments",
-    "cuts": "simulated power cuts",
+    "cuts": "simulated power cuts", "disks": "full disks", "permissions": "closed files and folders",
 }  # fmt: skip
 
 
@@ -181,6 +194,52 @@ class Trials:
 
         # One at a time: each is run where its photos are.
         return _side_by_side(work, self._root, 1)
+
+    def disks(self, most: int | None) -> list[Row]:
+        """Let the disk run full under commands, and run them again with space."""
+        if why_not := why_no_mounts():
+            print(f"{NAMES['disks']}: skipped: {why_not}")
+            return []
+        found = self._drawn([disk for disk in all_full_disks() if self._only in disk.name], most)
+        expected = {
+            name: in_child(
+                lambda n=name: result_unhindered(WRITERS[n].prepare, self.base, self._root / f"u {n}")
+            )
+            for name in dict.fromkeys(disk.command for disk in found)
+        }
+
+        def work(job: int) -> Iterator[Row]:
+            for number, disk in enumerate(found[job :: self._jobs]):
+                folder = self._root / f"disk-{job}-{number}"
+                wanted = expected[disk.command]
+                yield in_child(lambda d=disk, f=folder, w=wanted: try_full_disk(d, self.base, f, w))
+                _remove(folder)
+
+        return _side_by_side(work, self._root, self._jobs)
+
+    def permissions(self, most: int | None) -> list[Row]:
+        """Close files and folders to commands of an ordinary user, and follow the advice."""
+        if why_not := why_no_users():
+            print(f"{NAMES['permissions']}: skipped: {why_not}")
+            return []
+        found = self._drawn(
+            [closed for closed in all_closed(self.base / "scene") if self._only in closed.name], most
+        )
+        expected = {
+            name: in_child(
+                lambda n=name: result_unhindered(DOINGS[n].prepare, self.base, self._root / f"p {n}")
+            )
+            for name in dict.fromkeys(closed.command for closed in found)
+        }
+
+        def work(job: int) -> Iterator[Row]:
+            for number, closed in enumerate(found[job :: self._jobs]):
+                folder = self._root / f"closed-{job}-{number}"
+                wanted = expected[closed.command]
+                yield in_child(lambda c=closed, f=folder, w=wanted: try_closed(c, self.base, f, w))
+                _remove(folder)
+
+        return _side_by_side(work, self._root, self._jobs)
 
 
 def _result_of_whole(base: Path, folder: Path, scene: str) -> dict[str, Any]:

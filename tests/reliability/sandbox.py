@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import json
 import os
@@ -35,6 +36,7 @@ TIME_LIMIT_S = 60.0
 EXTRA_ADDRESS_BYTES = 4 << 30
 LARGEST_FILE_BYTES = 1 << 30
 NOBODY = 65534
+_PR_SET_SECUREBITS = 28
 GRACE_S = 2.0
 
 _HASHED_BYTES = 1 << 26
@@ -155,6 +157,7 @@ def run_command(
     folder: Path,
     *,
     as_nobody: bool = False,
+    as_owner: bool = False,
     limit_s: float = TIME_LIMIT_S,
     kill_after_s: float | None = None,
     first: Callable[[], None] = lambda: None,
@@ -168,6 +171,8 @@ def run_command(
         Holds the working directory ``work``; temporary files, home and output go beside it.
     as_nobody : bool
         Without the rights of root, for which no file is unreadable.
+    as_owner : bool
+        The same, but as the owner of the files: root without the powers that make it root.
     limit_s : float
         After that it counts as hung.
     kill_after_s : float, optional
@@ -188,6 +193,8 @@ def run_command(
         code = 70
         try:
             _enter(folder, as_nobody)
+            if as_owner:
+                _drop_powers()
             first()
             code = call(arguments)
         finally:
@@ -235,6 +242,18 @@ def _enter(folder: Path, as_nobody: bool) -> None:
         os.setgroups([])
         os.setresgid(NOBODY, NOBODY, NOBODY)
         os.setresuid(NOBODY, NOBODY, NOBODY)
+
+
+def _drop_powers() -> None:
+    """Give up all capabilities of this process and of those that it starts."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    no_powers_of_root, version_3 = 0b11, 0x20080522
+    for failed in (
+        libc.prctl(_PR_SET_SECUREBITS, no_powers_of_root, 0, 0, 0),
+        libc.capset((ctypes.c_uint32 * 2)(version_3, 0), (ctypes.c_uint32 * 6)()),
+    ):
+        if failed:
+            raise OSError(ctypes.get_errno(), "the powers of root cannot be given up here")
 
 
 def _wait(pid: int, until: float) -> tuple[int, Any, bool]:

@@ -32,10 +32,26 @@ def test_a_few_bad_inputs_and_kills_do_no_harm() -> None:
     assert "bad inputs: 6, with faults: 0" in printed
 
 
+def test_a_few_full_disks_and_closed_files_do_no_harm() -> None:
+    printed = attempt("disks", "permissions", "--most", "4")
+    if "skipped" not in printed:
+        assert "full disks: 4, with faults: 0" in printed
+    assert "closed files and folders: 4, with faults: 0" in printed
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "number"), [("inputs", 1000), ("damages", 250), ("cuts", 100)])
+@pytest.mark.parametrize(
+    ("what", "number"), [("inputs", 1000), ("damages", 250), ("cuts", 100), ("permissions", 200)]
+)
 def test_nothing_does_harm(what: str, number: int) -> None:
     assert f": {number}, with faults: 0" in attempt(what, "--most", str(number), seed=KNOWN_SEED)
+
+
+@pytest.mark.slow
+def test_full_disks_do_no_harm() -> None:
+    printed = attempt("disks", seed=KNOWN_SEED)
+    if "skipped" not in printed:
+        assert ", with faults: 0" in printed
 
 
 @pytest.mark.slow

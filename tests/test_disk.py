@@ -1,0 +1,59 @@
+import errno
+import os
+import resource
+import stat
+from pathlib import Path
+
+import pytest
+
+from corrsfm.disk import explain, is_of_the_disk, require_room, room_for
+
+
+def test_a_full_disk_is_named_by_what_was_to_be_written(tmp_path: Path) -> None:
+    error = OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "photo.jpg"))
+    assert is_of_the_disk(error)
+    assert explain(error, tmp_path / ".out.partial" / "images").startswith(
+        f"{tmp_path / 'out'}: cannot be written, the disk is full"
+    )
+
+
+def test_a_name_that_is_missing_is_no_matter_of_the_disk() -> None:
+    assert not is_of_the_disk(FileNotFoundError(errno.ENOENT, "No such file or directory", "x"))
+
+
+def test_the_advice_names_the_folder_on_the_way_and_opens_it(tmp_path: Path, monkeypatch) -> None:
+    closed = tmp_path / "a b"
+    (closed / "inner").mkdir(parents=True)
+    really = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: Path(path) != closed and really(path, mode)
+    )  # root may enter everything
+    text = explain(PermissionError(errno.EACCES, "Permission denied", str(closed / "inner" / "file")))
+    assert text == f"{closed}: may not be entered; change that with: chmod -R u+rwX '{closed}'"
+
+
+def test_room_that_is_there_leaves_nothing(tmp_path: Path) -> None:
+    with room_for(tmp_path, 1000, 0):
+        (tmp_path / "file").write_bytes(b"x")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.mark.skipif(not hasattr(os, "posix_fallocate"), reason="macOS cannot set space aside")
+def test_the_limit_of_the_shell_counts_for_each_file(tmp_path: Path) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, hard))
+    try:
+        require_room(tmp_path, 1 << 15, 1 << 16)
+        with pytest.raises(OSError, match="large") as refused:
+            require_room(tmp_path, 1 << 17)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert refused.value.filename == str(tmp_path)
+    assert "ulimit -f" in explain(refused.value)
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_that_is_open_stays_as_it_is(tmp_path: Path) -> None:
+    before = stat.S_IMODE(tmp_path.stat().st_mode)
+    require_room(tmp_path, 1)
+    assert stat.S_IMODE(tmp_path.stat().st_mode) == before
