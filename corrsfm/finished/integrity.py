@@ -74,7 +74,7 @@ def find_damage(workspace: Workspace) -> list[Damage]:
         if workspace.adding.exists() and stage == "models":
             remedy = shlex.join(["corrsfm", "add", str(workspace.root)])
         elif changed == [workspace.added]:
-            # What it said is lost; the models are not.
+            problem += "; what it says of added photos is lost, the models are not"
             removal = shlex.join(["rm", "-rf", str(workspace.added)])
             remedy = f"{removal}; {shlex.join(['corrsfm', 'report', str(workspace.root)])}"
         elif stage in _STORES and path.exists():

@@ -104,8 +104,8 @@ def read_added(workspace: Workspace) -> dict[str, dict[str, Any]]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         remedy = shlex.join(["rm", "-r", str(workspace.added)])
         raise WorkspaceError(
-            f"{workspace.added}: damaged ({error}); what it says of photos is lost, the models are not; "
-            f"run: {remedy}"
+            f"{workspace.added}: damaged ({error}); what it says of added photos is lost, the models are "
+            f"not; run: {remedy}"
         ) from error
 
 
