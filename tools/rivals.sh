@@ -6,10 +6,11 @@
 #
 # Without names: all of them. pairs/ holds what `corrsfm train prepare` makes, see the recipes. A run that was
 # stopped goes on where it was, and what is measured already is not measured again. The minutes are those of
-# the processor, so that a network that ran beside other work had no less than the rest.
+# the processor, so that a network that ran beside other work had no less than the rest. results/rivals/ holds
+# networks that were trained so.
 set -euo pipefail
 
-usage() { sed -n '2,9p' "$0" | sed 's/^# \{0,1\}//' >&2; exit 2; }
+usage() { sed -n '2,10p' "$0" | sed 's/^# \{0,1\}//' >&2; exit 2; }
 [ $# -ge 1 ] || usage
 task=$1
 shift
@@ -25,9 +26,12 @@ train)
 measure)
   methods=(--method ratio0.8+mutual/poselib --method ratio0.8+mutual/ransac)
   for name in "${names[@]}"; do
+    # As trained here, or else as trained before.
+    weights=runs/$name/latest.pt
+    [ -e "$weights" ] || weights=results/rivals/$name.pt
     # The verdict of the papers, then the same LO-RANSAC for all, and OpenCV's RANSAC as the papers use it.
     for estimator in w8pt poselib ransac; do
-      methods+=(--method "$name@pose:runs/$name/latest.pt/$estimator")
+      methods+=(--method "$name@pose:$weights/$estimator")
     done
   done
   corrsfm evaluate pose pairs/val.h5 "${methods[@]}" --results results/rivals_pose.json
