@@ -22,8 +22,10 @@ from corrsfm import config as cfg
 from corrsfm.colmap.models import poses_of
 from corrsfm.errors import CorrsfmError, ImageError, InputError, WorkspaceError
 from corrsfm.finished.add import add_photos
+from corrsfm.finished.integrity import find_damage
 from corrsfm.geometry import relative_pose, rotation_angle_deg
 from corrsfm.pipeline import run_scene
+from corrsfm.report.stage import report
 from corrsfm.workspace import Workspace
 
 RUN = CONFIG.run
@@ -143,6 +145,53 @@ def test_mapping_again_keeps_a_copy_and_says_that_poses_move(
     assert contents(scene.workspace / "sparse.old") == before
     assert "all photos are mapped again now and every pose moves" in caplog.text
     assert not (scene.workspace / "added.json").exists()
+
+
+def test_a_lost_list_of_pairs_comes_back_as_the_addition_left_it(grown: SceneToGrow, tmp_path: Path) -> None:
+    scene = grown.copy(tmp_path / "own")
+    before = contents(scene.workspace)
+    (scene.workspace / "pairs.txt").unlink()
+    run_scene(scene.photos, scene.workspace, CONFIG)
+    after = contents(scene.workspace)
+    lists = ("pairs.txt", "pair_origins.tsv", "added.json", "sparse/0/images.bin")
+    assert [after[name] for name in lists] == [before[name] for name in lists]
+
+
+@pytest.mark.parametrize("name", ["pair_origins.tsv", "database.db"])
+def test_what_an_addition_made_is_not_replaced_silently(
+    name: str, grown: SceneToGrow, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = grown.copy(tmp_path / "own")
+    before = contents(scene.workspace / "sparse")
+    (scene.workspace / name).unlink()
+    run_scene(scene.photos, scene.workspace, CONFIG)
+    if name == "database.db":
+        # Another database may call photos and cameras by other numbers.
+        assert "every pose moves" in caplog.text
+        assert contents(scene.workspace / "sparse.old") == before
+    else:
+        assert "those that corrsfm add chose are not kept" in caplog.text
+        assert contents(scene.workspace / "sparse") == before
+
+
+@pytest.mark.parametrize("content", [None, "", '{"photos": {"a.jpg": 3}}'])
+def test_the_loss_of_what_is_known_of_added_photos_costs_no_model(
+    content: str | None, grown: SceneToGrow, tmp_path: Path
+) -> None:
+    scene = grown.copy(tmp_path / "own")
+    workspace = Workspace(scene.workspace)
+    before = contents(workspace.sparse)
+    workspace.added.unlink()
+    if content is not None:
+        workspace.added.write_text(content)
+    (damage,) = find_damage(workspace)
+    assert damage.problem.endswith("what it says of added photos is lost, the models are not")
+    removal, again = damage.remedy.split("; ")
+    assert removal == f"rm -rf {workspace.added}" and again == f"corrsfm report {workspace.root}"
+    workspace.added.unlink(missing_ok=True)
+    report(Workspace(scene.workspace))
+    assert not find_damage(Workspace(scene.workspace))
+    assert contents(workspace.sparse) == before
 
 
 def test_the_seed_of_the_last_run_is_that_of_the_addition(scene: SceneToGrow) -> None:
