@@ -622,6 +622,24 @@ def test_photos_that_were_moved_cost_the_colours_only(
     assert pipeline.reconstruct(workspace, config, RUN).skipped
 
 
+def test_a_photo_of_another_size_costs_the_colours_only(
+    workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    verify(workspace, photos)
+    path = sorted(photos.iterdir())[0]
+    before = path.read_bytes()
+    assert cv2.imwrite(str(path), np.zeros((9, 9), np.uint8))
+    config = cfg.ReconstructionConfig(min_model_size=2)
+    assert not pipeline.reconstruct(workspace, config, RUN).skipped
+    assert (
+        f"the points stay black; {path}: is of another size than it was; run: corrsfm extract" in caplog.text
+    )
+    assert colours(workspace) == {(0, 0, 0)}
+    path.write_bytes(before)
+    assert not pipeline.reconstruct(workspace, config, RUN).skipped
+    assert len(colours(workspace)) > 3
+
+
 def test_verified_pairs_in_two_parts_are_told_before_mapping(
     workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

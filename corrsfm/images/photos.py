@@ -26,7 +26,15 @@ from corrsfm.files import open_file
 from corrsfm.images.cameras import PhotoInfo
 from corrsfm.images.headers import declared_size
 
-__all__ = ["CONVERTED_SUFFIXES", "convert_photo", "read_colour", "read_image", "read_mask", "read_photo_info"]
+__all__ = [
+    "CONVERTED_SUFFIXES",
+    "convert_photo",
+    "read_colour",
+    "read_image",
+    "read_mask",
+    "read_photo_info",
+    "stored_size",
+]
 
 CONVERTED_SUFFIXES = (".avif", ".heic", ".heif")
 """Photos that pycolmap does not read."""
@@ -237,6 +245,19 @@ def read_photo_info(path: Path) -> PhotoInfo:
         orientation=bitmap.exif_orientation() or 1,
         gps=_position(bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()),
     )
+
+
+def stored_size(path: Path) -> tuple[int, int] | None:
+    """Width and height of a photo by its header alone; None for a format whose header is not known here.
+
+    Raises
+    ------
+    ImageError
+        If it is no file, or asks for more memory than any photo needs.
+    """
+    with _opened(path, "re-export or remove the photo") as file:
+        file.seek(0)
+        return declared_size(file)
 
 
 def _position(

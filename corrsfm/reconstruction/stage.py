@@ -7,7 +7,7 @@ import logging
 import shlex
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +22,7 @@ from corrsfm.disk import is_closed, opening
 from corrsfm.errors import CorrsfmError, InputError, ReconstructionError, first_few
 from corrsfm.files import atomic_path, atomic_write_json
 from corrsfm.graph import connected_components
+from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, policy_for, select_model
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
@@ -31,7 +32,7 @@ from corrsfm.reconstruction.mapper import threads_for
 from corrsfm.reconstruction.record import record_of
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.lists import read_added, read_index
+from corrsfm.workspace.lists import Index, read_added, read_index
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
 from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
@@ -60,7 +61,8 @@ def reconstruct(
     fingerprint = fingerprint_of(verified.fingerprint, config, run.seed)
     # Models without colours are remade once the photos are back.
     black = config_hash("black", fingerprint)
-    images_dir = workspace.images_dir if workspace.images_dir.is_dir() else None
+    index = read_index(workspace)
+    images_dir, why_black = _photos_for_colours(workspace, index)
     current = [fingerprint] if images_dir else [fingerprint, black]
     if not overwrite and any(workspace.is_current("models", one, workspace.sparse / "0") for one in current):
         num = sum(1 for path in workspace.sparse.iterdir() if path.is_dir())
@@ -69,16 +71,10 @@ def reconstruct(
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
     _keep_grown_models(workspace)
-    names = read_index(workspace).names
-    if images_dir is not None:
-        _require_readable(images_dir, names)
+    names = index.names
     if images_dir is None:
         fingerprint = black
-        logger.warning(
-            "photos are no longer at %s; the points stay black; if they moved, run: %s",
-            workspace.images_dir,
-            workspace.command_for("images", images_dir="NEWDIR"),
-        )
+        logger.warning("%s", why_black)
     _warn_of_parts(workspace, names)
     chooses = config.mapper is cfg.Mapper.INCREMENTAL and config.max_models_tried > 1
     features = features_of(workspace)
@@ -116,11 +112,31 @@ def fingerprint_of(verified: str, config: cfg.ReconstructionConfig, seed: int) -
     return config_hash("models", pycolmap_version(), verified, config, seed)
 
 
-def _require_readable(folder: Path, names: Iterable[str]) -> None:
-    """Refuse photos that may not be read: pycolmap ends with an error of its own, or leaves points black."""
-    for path in (folder, *(folder / name for name in names)):
+def _photos_for_colours(workspace: Workspace, index: Index) -> tuple[Path | None, str]:
+    """The folder that points get their colours from; None, and why, if pycolmap would stumble there.
+
+    Raises
+    ------
+    InputError
+        If photos may not be read.
+    """
+    folder = workspace.images_dir
+    for path in (folder, *(folder / name for name in index.names)):
         if is_closed(path):
             raise InputError(opening(path))
+    if not folder.is_dir():
+        command = workspace.command_for("images", images_dir="NEWDIR")
+        return None, f"photos are no longer at {folder}; the points stay black; if they moved, run: {command}"
+    for record in index.records:
+        path, camera = folder / record.name, index.camera_of(record)
+        try:
+            size = stored_size(path) if path.exists() else None
+        except InputError as error:
+            return None, f"the points stay black; {error}"
+        if size is not None and size != (camera.width, camera.height):
+            again = workspace.command_for("images")
+            return None, f"the points stay black; {path}: is of another size than it was; run: {again}"
+    return folder, ""
 
 
 def _replace_evidence(workspace: Workspace, record: dict[str, Any] | None) -> None:

@@ -32,6 +32,12 @@ def cases() -> Iterator[Case]:
         yield Case(
             name=f"photo {label} localize", prepare=lambda place, n=name, c=content: _find(place, n, c)
         )
+    for label, (_, content) in _broken().items():
+        for command in AFTERWARDS:
+            yield Case(
+                name=f"photo {label} after a run {command}",
+                prepare=lambda place, c=content, n=command: _changed_since(place, c, n),
+            )
     for label, change in _exif().items():
         yield Case(name=f"exif {label}", prepare=lambda place, c=change: _with_exif(place, c))
     for label, name in _names().items():
@@ -43,6 +49,29 @@ def cases() -> Iterator[Case]:
 
 
 Content = Callable[[], bytes]
+
+AFTERWARDS = {
+    "splat": ["export", "scene", "out", "--for", "splat"],
+    "nerfstudio": ["export", "scene", "out", "--for", "nerfstudio"],
+    "colmap": ["export", "scene", "out", "--for", "colmap"],
+    "reconstruct": ["reconstruct", "scene", "--overwrite", "--threads", "1"],
+    "report": ["report", "scene"],
+    "check": ["check", "scene"],
+}
+"""Commands on a finished scene that look at its photos."""
+
+
+def _changed_since(place: Place, content: Content, command: str) -> Trial:
+    """A photo that is no longer what was reconstructed: no export may hold it, the rest does without."""
+    place.scene()
+    place.file("photos/1.jpg", content())
+    return Trial(
+        arguments=AFTERWARDS[command],
+        named=["1.jpg"],
+        writes=["out", "scene"] if command in ("reconstruct", "report") else ["out"],
+        expected=EITHER if command in ("reconstruct", "report", "check") else REFUSED,
+        begins=True,
+    )
 
 
 def _case(label: str, name: str, content: Content, command: str, expected: str) -> Case:
