@@ -32,6 +32,9 @@ def _run() -> None:
 
         commands(prog_name="corrsfm")
     finally:
+        # After an interruption of a text that was executed, as dataclasses do, Python would end by the signal,
+        # whatever the exit status; another text makes it forget that.
+        exec("")
         # Python's own end would answer an interruption with a traceback.
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
             signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -19,11 +19,11 @@ from corrsfm.cli.export import export
 from corrsfm.cli.finished import add, localize
 from corrsfm.cli.importing import import_
 from corrsfm.cli.options import OVERWRITE_KEY
+from corrsfm.cli.signals import interruptible
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.surroundings import (
     drop_bad_settings,
     guarded_streams,
-    interruptible,
     require_current_folder,
     told,
 )

@@ -1,8 +1,7 @@
-"""What surrounds a command: streams that are closed or full, the environment, memory, and signals."""
+"""What surrounds a command: streams that are closed or full, the environment, memory."""
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import errno
 import io
@@ -12,36 +11,20 @@ import re
 import select
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
-from types import FrameType
 from typing import Any
 
 import click
 
+from corrsfm.cli.signals import Interruption, interrupted_by
 from corrsfm.errors import ConfigError, CorrsfmError, printable
 
-__all__ = [
-    "Interruption",
-    "told",
-    "drop_bad_settings",
-    "guarded_streams",
-    "interruptible",
-    "require_current_folder",
-]
+__all__ = ["drop_bad_settings", "guarded_streams", "require_current_folder", "told"]
 
 _NO_MEMORY = re.compile(
     r"allocate|out of memory|insufficient memory|bad_alloc|failed to map segment|cannot map|start new thread",
     re.IGNORECASE,
 )
-# Long enough for whatever swallowed an interruption to return to the work.
-_AGAIN_AFTER_S = 0.05
-
-
-class Interruption(click.ClickException):
-    """Ctrl-C, with the exit status that shells give it, so that scripts and schedulers can tell."""
-
-    exit_code = 128 + signal.SIGINT
 
 
 class _Stream(io.FileIO):
@@ -161,51 +144,6 @@ def require_current_folder() -> None:
         ) from error
 
 
-class _Signals:
-    """Whether Ctrl-C was pressed, whatever became of the exception."""
-
-    was_interrupted = False
-
-    def interrupt(self, number: int, frame: FrameType | None) -> None:
-        self.was_interrupted = True
-        signal.default_int_handler(number, frame)
-
-
-_signals = _Signals()
-
-
-@contextlib.contextmanager
-def interruptible() -> Iterator[None]:
-    """Remember Ctrl-C, which a library may turn into another error or drop.
-
-    In a thread, or where Ctrl-C is ignored as in background jobs of a shell, nothing is changed.
-    """
-    _signals.was_interrupted = False
-    in_charge = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
-    if not in_charge:
-        yield
-        return
-    hook = sys.unraisablehook
-    signal.signal(signal.SIGINT, _signals.interrupt)
-    sys.unraisablehook = _interrupt_again
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _interrupt_again(dropped: Any) -> None:
-    """Repeat a Ctrl-C that came where Python has nobody to tell, as in a destructor."""
-    if isinstance(dropped.exc_value, KeyboardInterrupt):
-        threading.Timer(_AGAIN_AFTER_S, _thread.interrupt_main).start()
-    else:
-        sys.__unraisablehook__(dropped)
-
-
 @contextlib.contextmanager
 def told(how_to_go_on: Callable[[], str]) -> Iterator[None]:
     """Turn errors that a user can do something about into a line.
@@ -217,14 +155,15 @@ def told(how_to_go_on: Callable[[], str]) -> Iterator[None]:
     """
     try:
         yield
-    except (click.ClickException, click.exceptions.Exit):
+    except (click.ClickException, click.exceptions.Exit) as error:
         # What was interrupted may say that something is missing or broken.
-        if _signals.was_interrupted:
-            raise Interruption(f"interrupted; {how_to_go_on()}") from None
+        if number := interrupted_by():
+            raise Interruption(number, how_to_go_on()) from error
         raise
     except (Exception, KeyboardInterrupt) as error:
-        if _signals.was_interrupted or isinstance(error, KeyboardInterrupt):
-            raise Interruption(f"interrupted; {how_to_go_on()}") from error
+        number = interrupted_by()
+        if number or isinstance(error, KeyboardInterrupt):
+            raise Interruption(number or signal.SIGINT, how_to_go_on()) from error
         if isinstance(error, CorrsfmError):
             raise click.ClickException(printable(str(error))) from error
         if reason := _lack_of_memory(error):
