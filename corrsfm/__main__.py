@@ -32,8 +32,8 @@ def _run() -> None:
 
         commands(prog_name="corrsfm")
     finally:
-        # After an interruption of a text that was executed, as dataclasses do, Python would end by the signal,
-        # whatever the exit status; another text makes it forget that.
+        # After an interruption of a text that was executed, as dataclasses do, Python would end by that
+        # signal, whatever the exit status; another text makes it forget.
         exec("")
         # Python's own end would answer an interruption with a traceback.
         if signal.getsignal(signal.SIGINT) is signal.default_int_handler:

@@ -51,6 +51,7 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
     ("types", "errors"): "matches of other features are refused in one place",
     ("files", "errors"): "a file that cannot be read says so",
     ("cluster", "errors"): "a cluster that cannot be used says so",
+    ("cluster", "machine"): "processes of this machine start in one way",
     ("machine", "errors"): "a device that cannot be used says so",
     ("graph", "errors"): "long lists of names are cut in one place",
     ("graph", "types"): "a pair is two names",
