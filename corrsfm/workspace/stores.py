@@ -31,4 +31,5 @@ def pruned_of(workspace: Workspace, method: str | None = None) -> ItemStore[Pair
 def _store(workspace: Workspace, stage: str, path: Path, kind: Kind[K, T]) -> ItemStore[K, T]:
     record = workspace.record_of(stage)
     seal = record.fingerprint if record is not None else None
-    return ItemStore(path, kind, remedy=workspace.command_for(stage), seal=seal)
+    merges = not workspace.is_only_read
+    return ItemStore(path, kind, remedy=workspace.command_for(stage), seal=seal, merges=merges)
