@@ -52,7 +52,7 @@ from corrsfm.errors import ConfigError, InputError, WorkspaceError
 from corrsfm.files import FRAME_TIMES, OWN_RECORD, read_bytes, sha256_of
 from corrsfm.workspace.commands import command_for, label_of
 from corrsfm.workspace.entries import check_entries
-from corrsfm.workspace.lease import hold
+from corrsfm.workspace.lease import hold, holder_of
 from corrsfm.workspace.manifest import (
     FORMAT_VERSION,
     StageRecord,
@@ -245,12 +245,12 @@ class Workspace:
         self.modernise()
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):
-                handle = stack.enter_context(open(self.root / ".lock", encoding="utf-8"))
+                handle = stack.enter_context(open(self.root / ".lock", "rb", buffering=0))
                 try:
                     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
                 except BlockingIOError as error:
                     raise WorkspaceError(
-                        f"{self.root}: another corrsfm works in this workspace; wait for it"
+                        f"{self.root}: another corrsfm works in this workspace{holder_of(handle)}; wait for it"
                     ) from error
             check_entries(self.root, self._own_names, may_link=True)
             self._values = read_manifest(self.manifest)
