@@ -143,7 +143,8 @@ class Workspace:
             )
         if self.root.exists() and not self.root.is_dir():
             raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")
-        own = has_lost_manifest(self.root)
+        # Only corrsfm writes these files: the folder is a workspace that lost its manifest.
+        own = self.photo_cache.exists() or self.images_json.exists()
         foreign = [path.name for path in (self.database, self.sparse) if path.exists()]
         if foreign and not own:
             raise WorkspaceError(
@@ -249,8 +250,9 @@ class Workspace:
                 try:
                     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
                 except BlockingIOError as error:
+                    who = holder_of(handle)
                     raise WorkspaceError(
-                        f"{self.root}: another corrsfm works in this workspace{holder_of(handle)}; wait for it"
+                        f"{self.root}: another corrsfm works in this workspace{who}; wait for it"
                     ) from error
             check_entries(self.root, self._own_names, may_link=True)
             self._values = read_manifest(self.manifest)

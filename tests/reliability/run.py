@@ -1,6 +1,7 @@
-"""Tries to break corrsfm: bad inputs, damages of a scene, kills and power cuts.
+"""Tries to break corrsfm: bad inputs, damages of a scene, kills, power cuts and hostile surroundings.
 
-python tests/reliability/run.py inputs damages kills cuts --jobs 2 --results results/reliability.json
+python tests/reliability/run.py inputs damages kills cuts surroundings --jobs 2 \\
+    --results results/reliability.json
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from kills import COMMANDS, faults_after, kill_command, prepared, result_of, und
 from place import Place, make_base  # noqa: E402
 from power_cuts import record_cuts  # noqa: E402
 from sandbox import contents, fork, in_child, preload, run_command  # noqa: E402
+from surroundings import all_surroundings, try_surrounding  # noqa: E402
 
 Row = dict[str, Any]
 
@@ -47,11 +49,12 @@ COUNTED = {
     "damages": "the same, damage that changes results silently, advice that does not mend it",
     "kills": "finished work that is made again, another result than undisturbed, a file left",
     "cuts": "work that was said to be finished and is lost, another result, a file left",
+    "surroundings": "traceback, hang, wrong exit status, work stopped or lost, a file or process left",
 }
 """What each attempt counts as a fault, for the table of results."""
 NAMES = {
     "inputs": "bad inputs", "damages": "damages of a scene", "kills": "kills at random moments",
-    "cuts": "simulated power cuts",
+    "cuts": "simulated power cuts", "surroundings": "hostile surroundings",
 }  # fmt: skip
 
 
@@ -177,6 +180,20 @@ class Trials:
 
         # One at a time: each is run where its photos are.
         return _side_by_side(work, self._root, 1)
+
+    def surroundings(self, most: int | None) -> list[Row]:
+        """Start commands with streams closed or full, little memory, no folder, and under signals."""
+        found = self._drawn([one for one in all_surroundings() if self._only in one.name], most)
+        expected, _ = in_child(lambda: undisturbed("run", self.base, self._root / "in peace"))
+
+        def work(job: int) -> Iterator[Row]:
+            for number, one in enumerate(found[job :: self._jobs]):
+                folder = self._root / f"surrounding-{job}-{number}"
+                rng = random.Random(f"{self._seed} {one.name}")
+                yield try_surrounding(one, self.base, folder, expected, rng)
+                _remove(folder)
+
+        return _side_by_side(work, self._root, self._jobs)
 
 
 def _quietly(function: Callable[[], None]) -> None:

@@ -32,8 +32,14 @@ def test_a_few_bad_inputs_and_kills_do_no_harm() -> None:
     assert "bad inputs: 6, with faults: 0" in printed
 
 
+def test_a_few_hostile_surroundings_do_no_harm() -> None:
+    assert "hostile surroundings: 4, with faults: 0" in attempt("surroundings", "--most", "4")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "number"), [("inputs", 1000), ("damages", 250), ("cuts", 100)])
+@pytest.mark.parametrize(
+    ("what", "number"), [("inputs", 1000), ("damages", 250), ("cuts", 100), ("surroundings", 100)]
+)
 def test_nothing_does_harm(what: str, number: int) -> None:
     assert f": {number}, with faults: 0" in attempt(what, "--most", str(number), seed=KNOWN_SEED)
 
