@@ -26,9 +26,11 @@ import importlib
 # pycolmap's wheel exports zlib symbols; unless the real zlib is loaded first, the first zlib compression
 # after `import pycolmap` aborts the process.
 import zlib  # noqa: F401
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # typing takes a third of the time to import, which "corrsfm --help" should not
 if TYPE_CHECKING:
+    from typing import Any
+
     from corrsfm.config import PipelineConfig
     from corrsfm.export.scene import ExportResult, export_scene
     from corrsfm.finished.add import AddResult, add_photos

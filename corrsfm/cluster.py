@@ -24,6 +24,7 @@ from typing import Any, TypeVar
 
 from corrsfm import __version__
 from corrsfm.errors import ClusterError, ConfigError, CorrsfmError, DependencyError
+from corrsfm.machine import unheard_by_children
 
 __all__ = ["Cluster", "connected"]
 
@@ -96,16 +97,17 @@ class Cluster:
             # Dask leaves files where its scheduler and its workers were.
             scratch = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="corrsfm-"))
             self._stack.enter_context(dask.config.set({"temporary-directory": scratch}))
-            target = self._stack.enter_context(
-                LocalCluster(
-                    n_workers=self.workers,
-                    threads_per_worker=1,
-                    # The limit would kill a worker at its share of the memory.
-                    memory_limit=0,
-                    dashboard_address=":0",
-                    silence_logs=logging.CRITICAL,
+            with unheard_by_children():
+                target = self._stack.enter_context(
+                    LocalCluster(
+                        n_workers=self.workers,
+                        threads_per_worker=1,
+                        # The limit would kill a worker at its share of the memory.
+                        memory_limit=0,
+                        dashboard_address=":0",
+                        silence_logs=logging.CRITICAL,
+                    )
                 )
-            )
         try:
             if self.address is not None:
                 _greet(self.address)

@@ -18,7 +18,16 @@ from typing import Any, TypeVar
 from corrsfm import __version__
 from corrsfm.errors import ConfigError
 
-__all__ = ["count_threads", "end_with_parent", "find_device", "threaded", "use_threads", "versions"]
+__all__ = [
+    "count_threads",
+    "end_with_parent",
+    "find_device",
+    "hear_interruptions",
+    "threaded",
+    "unheard_by_children",
+    "use_threads",
+    "versions",
+]
 
 RECORDED_PACKAGES = ("torch", "pycolmap", "opencv-python-headless", "numpy", "h5py")
 
@@ -109,6 +118,29 @@ def end_with_parent(sentinel: int) -> None:
     # The thread waits for native code that holds the interpreter, Linux does not. Others have no prctl.
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
+@contextlib.contextmanager
+def unheard_by_children() -> Iterator[None]:
+    """Start processes, or threads that start some, which do not get the Ctrl-C that a terminal sends to all.
+
+    They would answer it with a traceback each. This process hears it as before, at the latest afterwards.
+    """
+    from multiprocessing import resource_tracker
+
+    # Started later, by the first of these processes, it would unblock the signal again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def hear_interruptions() -> None:
+    """In a process that was started `unheard_by_children`: from now on let Ctrl-C end it, without a word."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
 
 
 def versions(packages: Iterable[str] = RECORDED_PACKAGES) -> dict[str, str]:

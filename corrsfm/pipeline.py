@@ -112,7 +112,8 @@ def run_scene(
         except ReconstructionError as error:
             report(workspace, html=True)
             raise ReconstructionError(f"{error}\nevery photo and pair: {workspace.report_html}") from error
-        atomic_write_json(workspace.run_json, _run_record(workspace, config))
+        with workspace.writing(workspace.run_json):
+            atomic_write_json(workspace.run_json, _run_record(workspace, config))
         return report(workspace, html=True)
 
 

@@ -53,6 +53,7 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
     ("files", "disk"): "what a full disk and a closed folder say has one home",
     ("files", "errors"): "a file that cannot be read says so",
     ("cluster", "errors"): "a cluster that cannot be used says so",
+    ("cluster", "machine"): "processes of this machine start in one way",
     ("machine", "errors"): "a device that cannot be used says so",
     ("graph", "errors"): "long lists of names are cut in one place",
     ("graph", "types"): "a pair is two names",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import sys
 from typing import Any
 
@@ -20,10 +19,16 @@ from corrsfm.cli.export import export
 from corrsfm.cli.finished import add, localize
 from corrsfm.cli.importing import import_
 from corrsfm.cli.options import OVERWRITE_KEY
+from corrsfm.cli.signals import interruptible
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
+from corrsfm.cli.surroundings import (
+    drop_bad_settings,
+    guarded_streams,
+    require_current_folder,
+    told,
+)
 from corrsfm.cli.train import train
-from corrsfm.disk import explain, is_of_the_disk
-from corrsfm.errors import CorrsfmError, printable
+from corrsfm.errors import printable
 
 __all__ = ["main"]
 
@@ -38,30 +43,23 @@ class _Handler(logging.Handler):
         tqdm.write(prefix + printable(record.getMessage()), file=sys.stderr)
 
 
-class _Interruption(click.ClickException):
-    """Ctrl-C, with the exit status that shells give it, so that scripts and schedulers can tell."""
-
-    exit_code = 128 + signal.SIGINT
-
-
 class _Commands(click.Group):
     """A group that lists its commands in the order of a reconstruction and turns errors into text."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(self.commands)
 
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        with guarded_streams(), interruptible():
+            return super().main(*args, **kwargs)
+
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        with told(lambda: "run the same command again"):
+            return super().make_context(*args, **kwargs)
+
     def invoke(self, ctx: click.Context) -> Any:
-        try:
+        with told(lambda: _how_to_go_on(ctx)):
             return super().invoke(ctx)
-        except CorrsfmError as error:
-            raise click.ClickException(printable(str(error))) from error
-        except OSError as error:
-            # A full disk or a closed folder may be met anywhere; other errors are faults of corrsfm.
-            if not is_of_the_disk(error):
-                raise
-            raise click.ClickException(printable(explain(error))) from error
-        except KeyboardInterrupt as error:
-            raise _Interruption(f"interrupted; {_how_to_go_on(ctx)}") from error
 
 
 def _how_to_go_on(ctx: click.Context) -> str:
@@ -88,6 +86,8 @@ def main(quiet: bool, attended: bool) -> None:
     commands too; `corrsfm export WORKSPACE OUT --for TOOL` hands the result on. Finished work is kept: after
     an interruption or a changed option, run the same command again.
     """
+    require_current_folder()
+    drop_bad_settings()
     if attended:
         from corrsfm.machine import end_with_parent
 

@@ -65,7 +65,9 @@ def check(
     promising first. Changes nothing. Ends with code 1 if there is damage or no model, or if the verdict on it
     is "wrong".
     """
-    if len(photos) == 1 and os.path.lexists(photos[0] / "workspace.json"):
+    from corrsfm.workspace.manifest import has_lost_manifest
+
+    if len(photos) == 1 and (os.path.lexists(photos[0] / "workspace.json") or has_lost_manifest(photos[0])):
         show_workspace(photos[0], as_json, integrity)
         return
     from corrsfm.config import PipelineConfig, RunConfig

@@ -8,7 +8,7 @@ import click
 
 from corrsfm import config as cfg
 from corrsfm.cli.options import PATH, echo_json, json_option, run_options
-from corrsfm.errors import first_few
+from corrsfm.errors import first_few, printable
 
 __all__ = ["add", "localize", "show_workspace"]
 
@@ -145,7 +145,7 @@ def show_workspace(workspace_dir: Path, as_json: bool, integrity: bool) -> None:
         for lost in result.missing:
             click.echo(f"missing: {lost.name}: {lost.reason}: {lost.detail}")
         for number, finding in enumerate(result.findings, start=1):
-            click.echo(f"{number}. {finding.text}\n   next: {finding.next_step}")
+            click.echo(printable(f"{number}. {finding.text}\n   next: {finding.next_step}"))
         if not result.findings:
             click.echo("nothing to object to")
     if not result.is_usable:

@@ -120,11 +120,24 @@ def export_scene(
         If the output is not free, photos are gone, the model lacks points that the target needs, or a camera
         or name does not fit the target. Nothing is left behind.
     WorkspaceError
-        If the workspace has no current model, or the output cannot be written.
+        If the workspace has no current model, another process works there, or the output cannot be written.
     """
-    source, path, target = Workspace(Path(workspace)), Path(output), _target_of(target)
-    source.check_readable()
-    _require_model(source, needs_features=target is ExportTarget.HLOC)
+    source, target = Workspace(Path(workspace)), _target_of(target)
+    with source.reading():
+        _require_model(source, needs_features=target is ExportTarget.HLOC)
+        return _export_models(source, Path(output), target, images_dir, upright, scale, crop)
+
+
+def _export_models(
+    source: Workspace,
+    path: Path,
+    target: ExportTarget,
+    images_dir: Path | str | None,
+    upright: bool,
+    scale: tuple[str, str, float] | Literal["gps"] | None,
+    crop: bool,
+) -> ExportResult:
+    """As `export_scene`, while nobody writes in the workspace."""
     photos = Path(images_dir) if images_dir is not None else source.images_dir
     _check_output(path, source, photos, is_file=target in _FILES)
     index = read_index(source)

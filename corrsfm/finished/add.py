@@ -53,6 +53,7 @@ from corrsfm.report.stage import report
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import Camera, Pair, PairList
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.last_run import seed_of_last_run
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_index, write_pairs
 from corrsfm.workspace.models import models_of
 from corrsfm.workspace.resume import StageOutcome, finish, photos_left_out
@@ -186,11 +187,7 @@ def add_photos(
 
 def _with_seed(run: cfg.RunConfig, workspace: Workspace) -> cfg.RunConfig:
     """The seed of the scene's last run if none was asked for, so that its records keep fitting."""
-    try:
-        seed = read_json(workspace.run_json)["seed"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return run
-    return dataclasses.replace(run, seed=run.seed or int(seed))
+    return dataclasses.replace(run, seed=run.seed or seed_of_last_run(workspace) or 0)
 
 
 class _Addition:

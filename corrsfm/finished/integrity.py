@@ -87,6 +87,17 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             if path.exists():
                 remedy = f"{shlex.join(['rm', '-r', str(path)])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
+    return [*found, *_changed_records(workspace)]
+
+
+def _changed_records(workspace: Workspace) -> list[Damage]:
+    """What hangs on no stage: the reports, and the record of the last run, which only a run can write."""
+    found = []
+    for path in workspace.changed_records():
+        remedy = shlex.join(["rm", "-r", str(path)])
+        if path != workspace.run_json:
+            remedy += "; " + shlex.join(["corrsfm", "report", str(workspace.root)])
+        found.append(Damage(path=path, problem="not as it was written", remedy=remedy))
     return found
 
 

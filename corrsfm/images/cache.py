@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import hashlib
+import json
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
@@ -33,10 +36,12 @@ class PhotoCache:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._kept: dict[str, dict[str, Any]] = {}
-        try:
-            self._known = dict(read_json(path))
-        except (OSError, ValueError, TypeError):
-            self._known = {}
+        self._known: dict[str, dict[str, Any]] = {}
+        with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
+            values = read_json(path)
+            # One digit of a hash or of a focal length would otherwise change what is made from the photo.
+            if values["checksum"] == _checksum(values["photos"]):
+                self._known = values["photos"]
 
     def hash_of(self, path: Path) -> str:
         """As `corrsfm.files.sha256_of`."""
@@ -63,7 +68,7 @@ class PhotoCache:
 
     def save(self) -> None:
         """Write the cache with the photos asked for since construction, and no others."""
-        atomic_write_json(self._path, self._kept)
+        atomic_write_json(self._path, {"photos": self._kept, "checksum": _checksum(self._kept)})
 
 
 def photos_unlike(
@@ -92,3 +97,7 @@ def photos_unlike(
         except InputError:
             missing.append(record.name)
     return missing, changed
+
+
+def _checksum(values: Any) -> str:
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

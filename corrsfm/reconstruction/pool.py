@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from corrsfm.files import read_json
-from corrsfm.machine import end_with_parent
+from corrsfm.machine import end_with_parent, hear_interruptions, unheard_by_children
 from corrsfm.reconstruction.candidates import Candidate, map_candidate
 
 if TYPE_CHECKING:
@@ -92,7 +92,9 @@ class CandidatePool:
                 for candidate in candidates
             ]
             try:
-                for _ in self._executor.map(_map_in_process, jobs):
+                with unheard_by_children():
+                    outcomes = self._executor.map(_map_in_process, jobs)
+                for _ in outcomes:
                     pass
             except BrokenProcessPool:
                 # Killed for memory, or started from a script without a main guard.
@@ -121,6 +123,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     end_with_parent(parent.sentinel)
+    hear_interruptions()
 
 
 def _map_in_process(job: tuple[Candidate, Path, Path, dict[str, object]]) -> None:

@@ -52,16 +52,17 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
             StageWarning(stage=stage, message=message) for stage, messages in said for message in messages
         ),
     )
-    atomic_write_json(workspace.report_json, summary.to_dict())
-    if html:
-        write_html(
-            summary,
-            workspace.report_html,
-            model=models[0] if models else None,
-            images_dir=workspace.images_dir,
-            load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
-            load_verified=lambda name0, name1: _points_of_verified(workspace, (name0, name1)),
-        )
+    with workspace.writing(workspace.report_json, *([workspace.report_html] if html else [])):
+        atomic_write_json(workspace.report_json, summary.to_dict())
+        if html:
+            write_html(
+                summary,
+                workspace.report_html,
+                model=models[0] if models else None,
+                images_dir=workspace.images_dir,
+                load_matches=lambda name0, name1: _points_of_matches(workspace, (name0, name1)),
+                load_verified=lambda name0, name1: _points_of_verified(workspace, (name0, name1)),
+            )
     return summary
 
 

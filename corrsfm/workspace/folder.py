@@ -54,8 +54,14 @@ from corrsfm.errors import ConfigError, InputError, WorkspaceError
 from corrsfm.files import FRAME_TIMES, OWN_RECORD, read_bytes, sha256_of
 from corrsfm.workspace.commands import command_for, label_of
 from corrsfm.workspace.entries import check_entries
-from corrsfm.workspace.lease import hold
-from corrsfm.workspace.manifest import FORMAT_VERSION, StageRecord, read_manifest, write_manifest
+from corrsfm.workspace.lease import hold, holder_of
+from corrsfm.workspace.manifest import (
+    FORMAT_VERSION,
+    StageRecord,
+    has_lost_manifest,
+    read_manifest,
+    write_manifest,
+)
 
 __all__ = ["Workspace"]
 
@@ -121,11 +127,18 @@ class Workspace:
         # What was there before this workspace was begun, and which folders were made for it; None if it was
         # begun earlier.
         self._begun: tuple[set[str], list[Path]] | None = None
+        self.is_only_read = False
         if not self.manifest.exists():
             self._start(create)
         self._values = read_manifest(self.manifest)
 
     def _start(self, create: bool) -> None:
+        if not create and has_lost_manifest(self.root):
+            raise WorkspaceError(
+                f"{self.root}: is a workspace that lost {self.manifest.name}; make it again with the command "
+                f"and the options that made it, such as: corrsfm run PHOTOS "
+                f"{shlex.quote(str(self.root))}; finished features and matches are kept"
+            )
         if not create:
             raise WorkspaceError(
                 f"{self.root}: not a corrsfm workspace; make one with: corrsfm extract IMAGES {self.root}"
@@ -235,26 +248,19 @@ class Workspace:
         self.modernise()
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):
-                handle = stack.enter_context(open(self.root / ".lock", encoding="utf-8"))
+                handle = stack.enter_context(open(self.root / ".lock", "rb", buffering=0))
                 try:
                     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
                 except BlockingIOError as error:
+                    who = holder_of(handle)
                     raise WorkspaceError(
-                        f"{self.root}: another corrsfm works in this workspace; wait for it"
+                        f"{self.root}: another corrsfm works in this workspace{who}; wait for it"
                     ) from error
             check_entries(self.root, self._own_names, may_link=True)
             self._values = read_manifest(self.manifest)
+            self.is_only_read = True
+            stack.callback(setattr, self, "is_only_read", False)
             yield
-
-    def check_readable(self) -> None:
-        """Make sure that everything may be read, before a library meets what may not.
-
-        Raises
-        ------
-        WorkspaceError
-            Naming what may not, and the command that changes that.
-        """
-        check_entries(self.root, self._own_names, may_link=True)
 
     @property
     def _own_names(self) -> list[str]:
@@ -443,6 +449,27 @@ class Workspace:
         if record.get("files", {}).pop(path.name, None) is not None:
             self._write()
 
+    @contextlib.contextmanager
+    def writing(self, *paths: Path) -> Iterator[None]:
+        """Write reports or records that hang on no stage; what they then hold is remembered.
+
+        A kill leaves them unknown, not changed.
+        """
+        written = self._values.setdefault("written", {})
+        if any([written.pop(path.name, None) for path in paths]):
+            self._write()
+        yield
+        written |= {path.name: digest for path in paths if (digest := self._digest(path.name)) is not None}
+        self._write()
+
+    def changed_records(self) -> list[Path]:
+        """Files of `writing` that do not hold what was written; one that is gone was removed on purpose."""
+        return [
+            self.root / name
+            for name, wanted in self._values.get("written", {}).items()
+            if os.path.lexists(self.root / name) and self._digest(name) != wanted
+        ]
+
     def forget(self, stage: str) -> None:
         """Drop the record of a stage, so that it is not taken for finished."""
         if self._values["stages"].pop(stage, None) is not None:
@@ -461,6 +488,7 @@ class Workspace:
         and replace what was moved there before. An addition to them can no longer be finished.
         """
         self.forget("models")
+        self._values.pop("written", None)
         self.adding.unlink(missing_ok=True)
         if verified := self.record_of("verified matches"):
             self._values["mapping_failed"] = verified.fingerprint

@@ -29,7 +29,7 @@ from pathlib import Path
 from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import WorkspaceError
 
-__all__ = ["BEAT_SECONDS", "LEASE_SECONDS", "hold"]
+__all__ = ["BEAT_SECONDS", "LEASE_SECONDS", "hold", "holder_of"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -123,7 +123,7 @@ def _take(path: Path, me: _Holder, wait: bool) -> FileIO:
             time.sleep(SETTLE_SECONDS)
         if state not in (_State.HELD, _State.UNSURE):
             continue
-        who = f" ({holder})" if holder is not None else ""
+        who = _named(holder)
         may_be_dead = state is _State.UNSURE and seen in (None, renewed)
         if not wait and not may_be_dead:
             raise WorkspaceError(
@@ -134,6 +134,28 @@ def _take(path: Path, me: _Holder, wait: bool) -> FileIO:
             logger.warning("%s: waiting for another corrsfm%s to end", path.parent, who)
         seen = renewed
         time.sleep(POLL_SECONDS)
+
+
+def holder_of(file: FileIO) -> str:
+    """The holder that an open lock file names, in brackets and with a space before; empty if none."""
+    return _named(_read(file))
+
+
+def _named(holder: _Holder | None) -> str:
+    if holder is None:
+        return ""
+    if holder.is_here and _is_stopped(holder.process):
+        return f" ({holder}, which is stopped; let it go on with: kill -CONT {holder.process})"
+    return f" ({holder})"
+
+
+def _is_stopped(process: int) -> bool:
+    """Whether a process of this machine was stopped, by Ctrl-Z say, as far as the system tells."""
+    try:
+        state = Path(f"/proc/{process}/stat").read_text("utf-8", "replace").rpartition(")")[2].split()[0]
+    except (OSError, IndexError):
+        return False
+    return state == "T"
 
 
 def _judge(file: FileIO, path: Path, me: _Holder, is_locked: bool | None) -> tuple[_State, _Holder | None]:

@@ -13,7 +13,7 @@ from corrsfm.disk import explain
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import atomic_write_json, read_json
 
-__all__ = ["FORMAT_VERSION", "StageRecord", "read_manifest", "write_manifest"]
+__all__ = ["FORMAT_VERSION", "StageRecord", "has_lost_manifest", "read_manifest", "write_manifest"]
 
 FORMAT_VERSION = 2
 # The features and matches of version 1 were HDF5 files; they are converted when a command writes there.
@@ -48,6 +48,15 @@ class StageRecord:
     num_reused: int = 0
     finished_at: str = ""
     files: dict[str, str] = field(default_factory=dict)
+
+
+def has_lost_manifest(folder: Path) -> bool:
+    """Whether a folder holds what only corrsfm writes, but no manifest."""
+    if (folder / "workspace.json").exists():
+        return False
+    return (folder / ".photos.json").exists() or all(
+        (folder / name).exists() for name in ("images.json", "images.txt")
+    )
 
 
 def write_manifest(path: Path, values: dict[str, Any]) -> None:

@@ -149,7 +149,12 @@ def merge_shards(workspace: Workspace, store: ItemStore[Any, Any]) -> int:
     num = 0
     for path in sorted(folder.glob("[!.]*")):
         try:
-            _merge(path, store)
+            try:
+                _merge(path, store)
+            except DamageError:
+                for loss in ItemStore(path, store.kind).mend():
+                    logger.warning("%s", loss)
+                _merge(path, store)
             num += 1
         except DamageError as error:
             logger.warning("%s; its items are made again", error)

@@ -15,6 +15,7 @@ import logging
 import os
 import shutil
 import sqlite3
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
@@ -46,6 +47,7 @@ logger = logging.getLogger("corrsfm")
 SYNC_SECONDS = 2.0
 KEYS_AT_ONCE = 500
 
+_LOGS = ("-wal", "-journal")
 _NOT_DAMAGE = {
     ("SQLITE_BUSY", "SQLITE_LOCKED"): (
         "in use by another program ({}); close it there and run again, finished work is kept"
@@ -53,7 +55,8 @@ _NOT_DAMAGE = {
     ("SQLITE_READONLY", "SQLITE_PERM", "SQLITE_CANTOPEN", "SQLITE_AUTH"): (
         "cannot be opened ({}); check the permissions of the file and its folder and run again"
     ),
-    ("SQLITE_FULL", "SQLITE_IOERR", "SQLITE_NOMEM"): (
+    ("SQLITE_NOMEM",): "not enough memory ({}); close other programs and run again, finished work is kept",
+    ("SQLITE_FULL", "SQLITE_IOERR"): (
         "the disk is full or failing ({}); free some space and run again, finished work is kept"
     ),
 }
@@ -74,16 +77,26 @@ class ItemStore(Generic[K, T]):
         The command that makes damaged items again; the remedy with --verify if not given.
     seal : str, optional
         What `commit` was given when the file was finished; another file in its place is refused.
+    merges : bool
+        Whether reading may put what a killed process wrote last into the file; else it looks at a copy.
     """
 
     def __init__(
-        self, path: Path, kind: Kind[K, T], *, remedy: str = "", mend: str = "", seal: str | None = None
+        self,
+        path: Path,
+        kind: Kind[K, T],
+        *,
+        remedy: str = "",
+        mend: str = "",
+        seal: str | None = None,
+        merges: bool = True,
     ) -> None:
         self.path = path
         self.kind = kind
         self._remedy = remedy or "the step that makes it"
         self._mend = mend or f"{self._remedy} --verify"
         self._seal = seal
+        self._merges = merges
         self._writing: sqlite3.Connection | None = None
         self._synced = 0.0
         # As long as it is not known.
@@ -244,26 +257,37 @@ class ItemStore(Generic[K, T]):
         with self._errors():
             if not self.path.is_file():
                 raise sqlite3.DatabaseError("is no file")
-        self._merge_log()
-        # Without a log beside it nobody writes, and no lock is needed, which some file systems lack.
-        uri = f"{self.path.absolute().as_uri()}?{'mode=ro' if self._has_log() else 'mode=ro&immutable=1'}"
-        with self._errors():
-            connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
-        with contextlib.closing(connection):
+        with contextlib.ExitStack() as stack:
+            uri = self._uri_to_read(stack)
+            with self._errors():
+                connection = sqlite3.connect(uri, uri=True, check_same_thread=False)
+            stack.enter_context(contextlib.closing(connection))
             with self._errors():
                 about = self._about(connection)
             if sealed and self._seal is not None and about.get("seal") != self._seal:
                 raise WorkspaceError(f"{self.path}: is not the file that its step wrote; run: {self._mend}")
             yield connection
 
-    def _merge_log(self) -> None:
-        """Put what a killed process wrote last into the file, where the file may be written."""
+    def _uri_to_read(self, stack: contextlib.ExitStack) -> str:
+        """Where to read what is in the file and in the log that a killed process left beside it."""
+        if self._has_log() and not self._merges:
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="corrsfm-"))
+            copy = Path(folder) / self.path.name
+            try:
+                for suffix in ("", *_LOGS):
+                    with contextlib.suppress(FileNotFoundError):
+                        shutil.copyfile(self._beside(suffix), f"{copy}{suffix}")
+            except OSError as error:
+                raise WorkspaceError(f"{self.path}: cannot be read ({error.strerror})") from error
+            return f"{copy.as_uri()}?mode=rw"
         if self._has_log() and os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK):
             self._writer()
             self.close()
+        # Without a log beside it nobody writes, and no lock is needed, which some file systems lack.
+        return f"{self.path.absolute().as_uri()}?{'mode=ro' if self._has_log() else 'mode=ro&immutable=1'}"
 
     def _has_log(self) -> bool:
-        return any(self._beside(suffix).exists() for suffix in ("-wal", "-journal"))
+        return any(self._beside(suffix).exists() for suffix in _LOGS)
 
     def _about(self, connection: sqlite3.Connection) -> dict[str, str]:
         (application,) = connection.execute("PRAGMA application_id").fetchone()

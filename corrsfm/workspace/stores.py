@@ -31,5 +31,6 @@ def pruned_of(workspace: Workspace, method: str | None = None) -> ItemStore[Pair
 def _store(workspace: Workspace, stage: str, path: Path, kind: Kind[K, T]) -> ItemStore[K, T]:
     record = workspace.record_of(stage)
     seal = record.fingerprint if record is not None else None
-    mend = workspace.command_for(stage, "--verify")
-    return ItemStore(path, kind, remedy=workspace.command_for(stage), mend=mend, seal=seal)
+    remedy, mend = workspace.command_for(stage), workspace.command_for(stage, "--verify")
+    merges = not workspace.is_only_read
+    return ItemStore(path, kind, remedy=remedy, mend=mend, seal=seal, merges=merges)

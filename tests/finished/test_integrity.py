@@ -15,7 +15,7 @@ from scene_to_grow import SceneToGrow, contents, make_scene_to_grow
 
 from corrsfm.cli import main
 from corrsfm.finished.check import check_workspace
-from corrsfm.finished.integrity import find_damage
+from corrsfm.finished.integrity import Damage, find_damage
 from corrsfm.workspace import Workspace
 
 
@@ -76,6 +76,9 @@ def lose_an_item(path: Path) -> None:
         ("database", cut, "verified matches"),
         ("sparse", cut_model, "models"),
         ("sparse", shutil.rmtree, "models"),
+        ("report_json", cut, "report"),
+        ("report_html", cut, "report"),
+        ("run_json", change_a_digit, "run"),
     ],
 )
 def test_damage_is_named_and_its_remedy_mends_it(
@@ -98,7 +101,8 @@ def test_damage_is_named_and_its_remedy_mends_it(
                 shutil.rmtree(word, ignore_errors=True)
                 Path(word).unlink(missing_ok=True)
             continue
-        outcome = CliRunner().invoke(main, ["-q", *words, "--threads", str(CONFIG.run.threads)])
+        threads = [] if words[0] == "report" else ["--threads", str(CONFIG.run.threads)]
+        outcome = CliRunner().invoke(main, ["-q", *words, *threads])
         assert outcome.exit_code == 0, (command, outcome.output)
     assert find_damage(Workspace(workspace)) == []
     assert check_workspace(workspace).is_usable
@@ -108,3 +112,43 @@ def test_a_whole_scene_has_no_damage(workspace: Path) -> None:
     assert find_damage(Workspace(workspace)) == []
     result = json.loads(CliRunner().invoke(main, ["check", str(workspace), "--json"]).output)
     assert result["num_registered"] > 2 and result["is_usable"]
+
+
+def test_a_report_that_was_removed_is_no_damage(workspace: Path) -> None:
+    Workspace(workspace).report_html.unlink()
+    assert find_damage(Workspace(workspace)) == []
+
+
+def test_a_workspace_of_before_reports_were_remembered_has_no_damage(workspace: Path) -> None:
+    values = json.loads((workspace / "workspace.json").read_text("utf-8"))
+    del values["written"]
+    (workspace / "workspace.json").write_text(json.dumps(values), "utf-8")
+    cut(workspace / "report.html")
+    assert find_damage(Workspace(workspace)) == []
+
+
+def test_a_workspace_that_lost_its_manifest_is_not_taken_for_photos(workspace: Path) -> None:
+    (workspace / "workspace.json").unlink()
+    result = CliRunner().invoke(main, ["check", str(workspace)])
+    assert result.exit_code == 1
+    assert "is a workspace that lost workspace.json" in result.output
+    assert f"corrsfm run PHOTOS {workspace}" in result.output
+
+
+def test_a_log_that_lies_beside_a_store_is_read_but_not_merged(workspace: Path, tmp_path: Path) -> None:
+    path = Workspace(workspace).features
+    other = tmp_path / "other.db"
+    shutil.copy(path, other)
+    with contextlib.closing(sqlite3.connect(other, isolation_level=None)) as store:
+        store.execute("PRAGMA journal_mode = WAL")
+        store.execute("UPDATE items SET fingerprint = 'x'")
+        shutil.copy(f"{other}-wal", f"{path}-wal")
+    before = contents(workspace)
+    assert [one.path for one in find_damage_reading(workspace)] == [path]
+    assert contents(workspace) == before
+
+
+def find_damage_reading(workspace: Path) -> list[Damage]:
+    scene = Workspace(workspace)
+    with scene.reading():
+        return find_damage(scene)

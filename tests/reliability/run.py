@@ -1,6 +1,6 @@
-"""Tries to break corrsfm: bad inputs, damages of a scene, kills, power cuts, full disks and permissions.
+"""Tries to break corrsfm: bad inputs, damages, kills, power cuts, full disks, permissions, surroundings.
 
-python tests/reliability/run.py inputs damages kills cuts disks permissions --jobs 2 \\
+python tests/reliability/run.py inputs damages kills cuts disks permissions surroundings --jobs 2 \\
     --results results/reliability.json
 """
 
@@ -50,6 +50,7 @@ from permissions import DOINGS, all_closed, try_closed, why_no_users  # noqa: E4
 from place import Place, make_base  # noqa: E402
 from power_cuts import record_cuts  # noqa: E402
 from sandbox import contents, fork, in_child, preload, run_command  # noqa: E402
+from surroundings import all_surroundings, try_surrounding  # noqa: E402
 
 Row = dict[str, Any]
 
@@ -60,11 +61,13 @@ COUNTED = {
     "disks": "no line that says so, a file lost, changed or left, another result once there is space",
     "permissions": "no line that names the file, advice that does not help, a file changed, another result",
     "cuts": "work that was said to be finished and is lost, another result, a file left",
+    "surroundings": "traceback, hang, wrong exit status, work stopped or lost, a file or process left",
 }
 """What each attempt counts as a fault, for the table of results."""
 NAMES = {
     "inputs": "bad inputs", "damages": "damages of a scene", "kills": "kills at random moments",
     "cuts": "simulated power cuts", "disks": "full disks", "permissions": "closed files and folders",
+    "surroundings": "hostile surroundings",
 }  # fmt: skip
 
 
@@ -194,6 +197,20 @@ class Trials:
 
         # One at a time: each is run where its photos are.
         return _side_by_side(work, self._root, 1)
+
+    def surroundings(self, most: int | None) -> list[Row]:
+        """Start commands with streams closed or full, little memory, no folder, and under signals."""
+        found = self._drawn([one for one in all_surroundings() if self._only in one.name], most)
+        expected, _ = in_child(lambda: undisturbed("run", self.base, self._root / "in peace"))
+
+        def work(job: int) -> Iterator[Row]:
+            for number, one in enumerate(found[job :: self._jobs]):
+                folder = self._root / f"surrounding-{job}-{number}"
+                rng = random.Random(f"{self._seed} {one.name}")
+                yield try_surrounding(one, self.base, folder, expected, rng)
+                _remove(folder)
+
+        return _side_by_side(work, self._root, self._jobs)
 
     def disks(self, most: int | None) -> list[Row]:
         """Let the disk run full under commands, and run them again with space."""

@@ -24,6 +24,7 @@ __all__ = [
     "call",
     "contents",
     "differences",
+    "end_session",
     "fork",
     "in_child",
     "leftovers",
@@ -216,7 +217,7 @@ def run_command(
         seconds=seconds,
         peak_mb=usage.ru_maxrss / 1024,
         hung=not ended and kill_after_s is None,
-        orphans=_end_session(pid),
+        orphans=end_session(pid),
     )
 
 
@@ -270,7 +271,7 @@ def _wait(pid: int, until: float) -> tuple[int, Any, bool]:
         pause = min(2 * pause, 0.02)
 
 
-def _end_session(session: int) -> int:
+def end_session(session: int) -> int:
     """Kill what is left of a session; how many processes that were."""
     found = _members(session)
     # Helpers of multiprocessing end by themselves when they notice that their parent is gone.

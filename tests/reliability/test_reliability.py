@@ -39,9 +39,14 @@ def test_a_few_full_disks_and_closed_files_do_no_harm() -> None:
     assert "closed files and folders: 4, with faults: 0" in printed
 
 
+def test_a_few_hostile_surroundings_do_no_harm() -> None:
+    assert "hostile surroundings: 4, with faults: 0" in attempt("surroundings", "--most", "4")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("what", "number"), [("inputs", 1000), ("damages", 250), ("cuts", 100), ("permissions", 200)]
+    ("what", "number"),
+    [("inputs", 1000), ("damages", 250), ("cuts", 100), ("permissions", 200), ("surroundings", 100)],
 )
 def test_nothing_does_harm(what: str, number: int) -> None:
     assert f": {number}, with faults: 0" in attempt(what, "--most", str(number), seed=KNOWN_SEED)

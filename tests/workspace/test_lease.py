@@ -78,6 +78,18 @@ def test_another_process_is_named_and_its_death_frees_the_folder(path: Path) -> 
     assert path.read_bytes() == b""
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="the state of a process is read from /proc")
+def test_a_holder_that_is_stopped_is_said_to_be(path: Path) -> None:
+    other = holder(path)
+    try:
+        other.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, other.pid, os.WSTOPPED)
+        with pytest.raises(WorkspaceError, match=f"let it go on with: kill -CONT {other.pid}"), hold(path):
+            pass
+    finally:
+        end(other)
+
+
 def test_a_second_one_may_wait_for_the_first(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     other = holder(path)
     threading.Timer(0.5, other.kill).start()

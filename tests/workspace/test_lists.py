@@ -40,6 +40,19 @@ def test_a_photo_is_remembered_wherever_the_command_runs(
     assert PhotoCache(tmp_path / "cache.json").hash_of(Path("a.bmp")) == known
 
 
+@pytest.mark.parametrize("damage", ["digit", "shape", "cut"])
+def test_a_damaged_cache_of_photos_counts_as_empty(tmp_path: Path, damage: str) -> None:
+    (tmp_path / "a.bmp").write_bytes(b"one")
+    path = tmp_path / "cache.json"
+    cache = PhotoCache(path)
+    known = cache.hash_of(tmp_path / "a.bmp")
+    cache.save()
+    text = path.read_text("utf-8")
+    changed = {"digit": text.replace(known, "0" + known[1:]), "shape": '{"a": 3}', "cut": text[:-9]}
+    path.write_text(changed[damage], "utf-8")
+    assert PhotoCache(path).hash_of(tmp_path / "a.bmp") == known
+
+
 def test_pairs_of_any_names_come_back(tmp_path: Path) -> None:
     workspace = Workspace(tmp_path / "scene", create=True)
     pairs = PairList(

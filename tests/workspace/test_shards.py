@@ -1,6 +1,8 @@
 """Shards: what workers leave is merged by this run or the next; what they did not finish is made again."""
 
+import contextlib
 import logging
+import sqlite3
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -192,3 +194,19 @@ def test_blocks_hold_every_key_once_and_pairs_that_share_photos() -> None:
     assert [len(block) for block in blocks(names, 1)] == [16] * 12 + [8]
     assert [len(block) for block in blocks(names[:8], 16)] == [1] * 8
     assert list(blocks([], 3)) == []
+
+
+def test_whole_items_of_a_damaged_shard_are_kept(workspace: Workspace, store: Any) -> None:
+    folder = shards_of(workspace, store)
+    folder.mkdir(parents=True)
+    wanted = {pair: WANTED[pair] for pair in PAIRS[:4]}
+    shard = fill_shard(
+        str(workspace.root.absolute()), str(folder), ".db", "pruned", work, list(wanted), wanted,
+        cfg.RunConfig(threads=3), 1,
+    )  # fmt: skip
+    with contextlib.closing(sqlite3.connect(folder / shard.name)) as connection, connection:
+        connection.execute("UPDATE arrays SET data = x'00' WHERE number = 2")
+    assert merge_shards(workspace, store) == 1
+    kept = store.finished(WANTED)
+    assert len(kept) == 3 and kept < wanted.keys()
+    assert not workspace.shards.exists()

@@ -28,12 +28,12 @@ from corrsfm.evaluation.scenes.score import (
     score_poses,
 )
 from corrsfm.evaluation.scenes.sharing import KEPT_MATCHES, PUTATIVE_MATCHES, share_stages
-from corrsfm.files import read_json
 from corrsfm.geometry import Pose
 from corrsfm.prune import depends_on_seed
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import views_of
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.last_run import seed_of_last_run
 from corrsfm.workspace.models import models_of
 
 __all__ = [
@@ -256,13 +256,9 @@ def evaluate_seeds(folder: Path, ground_truth: Path, num_seeds: int, run: cfg.Ru
 def _config_of(workspace: Workspace, run: cfg.RunConfig) -> cfg.PipelineConfig:
     """The options that a workspace's models were made with, and their seed."""
     where = str(workspace.manifest)
-    try:
-        last_run = read_json(workspace.run_json)
-        if last_run["fingerprints"]["models"] == workspace.require("models").fingerprint:
-            run = dataclasses.replace(run, seed=int(last_run["seed"]))
-    except (OSError, ValueError, KeyError, TypeError):
-        # Made step by step: then no file holds the seed.
-        pass
+    seed = seed_of_last_run(workspace, workspace.require("models").fingerprint)
+    if seed is not None:
+        run = dataclasses.replace(run, seed=seed)
     return cfg.PipelineConfig(
         prune=_prune_config(workspace, workspace.require("pruned matches").config),
         database=cfg.from_dict(cfg.DatabaseConfig, workspace.require("verified matches").config, where),
