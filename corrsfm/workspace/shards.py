@@ -149,17 +149,23 @@ def merge_shards(workspace: Workspace, store: ItemStore[Any, Any]) -> int:
     num = 0
     for path in sorted(folder.glob("[!.]*")):
         try:
-            try:
-                _merge(path, store)
-            except DamageError:
-                for loss in ItemStore(path, store.kind).mend():
-                    logger.warning("%s", loss)
-                _merge(path, store)
+            _merge_whole_items(path, store)
             num += 1
         except DamageError as error:
             logger.warning("%s; its items are made again", error)
     discard_shards(workspace, store)
     return num
+
+
+def _merge_whole_items(path: Path, store: ItemStore[Any, Any]) -> None:
+    """Take in a shard, of a damaged one what is whole."""
+    try:
+        _merge(path, store)
+    except DamageError:
+        with contextlib.closing(ItemStore(path, store.kind)) as shard:
+            for loss in shard.mend():
+                logger.warning("%s", loss)
+        _merge(path, store)
 
 
 def discard_shards(workspace: Workspace, store: ItemStore[Any, Any]) -> None:

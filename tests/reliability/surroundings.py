@@ -151,7 +151,8 @@ def _signals() -> list[Surrounding]:
     ):
         for attempt in range(NUM_SIGNALS if not extra else NUM_SIGNALS // 4):
             name = " ".join(["run", *extra, number.name, str(attempt)])
-            codes = 0, 128 + number
+            # After its last line Python's own end leaves the signal to the system.
+            codes = 0, 128 + number, -number
             found.append(Surrounding(name=name, words=[*RUN, *extra], codes=codes, number=number))
     return found
 
@@ -188,7 +189,9 @@ def try_surrounding(
         faults.append(f"raw: {raw[0]}")
     if said.count("Error: ") > 1:
         faults.append("several errors")
-    if code == 1 and "Error: " not in said and "2>" not in one.shell:
+    # OpenBLAS ends the process by itself when it gets no memory, with a line of its own.
+    has_told = "Error: " in said or "OpenBLAS error: Memory allocation" in said
+    if code == 1 and not has_told and "2>" not in one.shell:
         faults.append("no message")
     if holder is not None:
         holder.send_signal(signal.SIGCONT)
