@@ -20,7 +20,7 @@ import click
 
 __all__ = ["Interruption", "interrupted_by", "interruptible"]
 
-# Long enough for whatever swallowed an interruption to return to the work.
+# Long enough for whatever swallowed an interruption to return to the work, or for an import to get on.
 AGAIN_AFTER_SECONDS = 0.05
 # Native code may not return for minutes; who sent SIGTERM sends SIGKILL after ten seconds or so.
 CLEARING_UP_SECONDS = 8.0
@@ -49,10 +49,28 @@ class _Caught:
 
     def handle(self, number: int, frame: FrameType | None) -> None:
         self.number = self.number or number
-        raise KeyboardInterrupt
+        # In the middle of it native code takes the exception for a broken package, or ends the process.
+        if _is_importing(frame):
+            _come_again()
+        else:
+            raise KeyboardInterrupt
 
 
 _caught = _Caught()
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _come_again() -> None:
+    again = threading.Timer(AGAIN_AFTER_SECONDS, _thread.interrupt_main)
+    again.daemon = True
+    again.start()
 
 
 def interrupted_by() -> int:
@@ -97,7 +115,7 @@ def interruptible() -> Iterator[None]:
 def _interrupt_again(dropped: Any) -> None:
     """Repeat an interruption that came where Python has nobody to tell, as in a destructor."""
     if isinstance(dropped.exc_value, KeyboardInterrupt):
-        threading.Timer(AGAIN_AFTER_SECONDS, _thread.interrupt_main).start()
+        _come_again()
     else:
         sys.__unraisablehook__(dropped)
 
