@@ -40,7 +40,9 @@ def test_a_few_full_disks_and_closed_files_do_no_harm() -> None:
 
 
 def test_a_few_hostile_surroundings_do_no_harm() -> None:
-    assert "hostile surroundings: 4, with faults: 0" in attempt("surroundings", "--most", "4")
+    # The same each time: the moment of a signal is chance enough.
+    printed = attempt("surroundings", "--most", "4", seed=KNOWN_SEED)
+    assert "hostile surroundings: 4, with faults: 0" in printed
 
 
 @pytest.mark.slow
