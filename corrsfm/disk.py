@@ -136,8 +136,10 @@ def require_room(folder: Path, *sizes: int) -> None:
         for number, size in enumerate(sizes):
             scratch = folder / f".room.{number}.partial"
             try:
+                # Left by a kill, or a link that somebody laid there to a file of the user's.
+                scratch.unlink(missing_ok=True)
+                handle = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
                 stack.callback(scratch.unlink, missing_ok=True)
-                handle = os.open(scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
                 stack.callback(os.close, handle)
                 # macOS has no such call; there what was written is checked, and that is all.
                 if hasattr(os, "posix_fallocate"):

@@ -1,3 +1,5 @@
+"""What a disk refuses is found out before it does harm, and said in one line."""
+
 import errno
 import os
 import resource
@@ -57,3 +59,13 @@ def test_a_folder_that_is_open_stays_as_it_is(tmp_path: Path) -> None:
     before = stat.S_IMODE(tmp_path.stat().st_mode)
     require_room(tmp_path, 1)
     assert stat.S_IMODE(tmp_path.stat().st_mode) == before
+
+
+def test_a_link_in_place_of_the_scratch_file_is_not_written_through(tmp_path: Path) -> None:
+    mine = tmp_path / "mine"
+    mine.write_text("kept")
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / ".room.0.partial").symlink_to(mine)
+    require_room(folder, 100)
+    assert mine.read_text() == "kept" and os.listdir(folder) == []
