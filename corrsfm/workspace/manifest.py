@@ -103,8 +103,12 @@ def read_manifest(path: Path) -> dict[str, Any]:
 
 
 def _checksum(values: dict[str, Any]) -> str:
-    """Of what a manifest says of stages; where the photos are may be edited."""
-    stages = [values["stages"], values.get("mapping_failed")]
+    """Of what a manifest says of stages and reports; where the photos are may be edited."""
+    stages = [
+        values["stages"],
+        values.get("mapping_failed"),
+        *([values["written"]] if "written" in values else []),
+    ]
     return hashlib.sha256(json.dumps(stages, sort_keys=True).encode()).hexdigest()
 
 
@@ -115,5 +119,8 @@ def _check_manifest(values: dict[str, Any]) -> None:
     given = values.get("given", [])
     if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
         raise TypeError("given is not a list of texts")
+    written = values.get("written", {})
+    if not isinstance(written, dict) or not all(isinstance(digest, str) for digest in written.values()):
+        raise TypeError("written is not a table of texts")
     for record in values["stages"].values():
         StageRecord(**record)
