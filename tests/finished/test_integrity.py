@@ -17,6 +17,7 @@ from corrsfm.cli import main
 from corrsfm.finished.check import check_workspace
 from corrsfm.finished.integrity import Damage, find_damage
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.manifest import read_manifest, write_manifest
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +121,9 @@ def test_a_report_that_was_removed_is_no_damage(workspace: Path) -> None:
 
 
 def test_a_workspace_of_before_reports_were_remembered_has_no_damage(workspace: Path) -> None:
-    values = json.loads((workspace / "workspace.json").read_text("utf-8"))
+    values = read_manifest(workspace / "workspace.json")
     del values["written"]
-    (workspace / "workspace.json").write_text(json.dumps(values), "utf-8")
+    write_manifest(workspace / "workspace.json", values)
     cut(workspace / "report.html")
     assert find_damage(Workspace(workspace)) == []
 
