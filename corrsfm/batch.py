@@ -173,13 +173,17 @@ def run_collection(
     Raises
     ------
     InputError
-        If the collection holds no scene.
+        If the collection holds no scene, or is the output.
     WorkspaceError
         If the output cannot be written.
     KeyboardInterrupt
         On Ctrl-C or SIGTERM, after ending the scenes under way; the same call resumes them.
     """
     scenes = find_scenes(collection, leave_out=output)
+    if output.resolve() == collection.resolve():
+        raise InputError(
+            f"{output}: is the collection itself; choose another folder, such as {output / 'out'}"
+        )
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:

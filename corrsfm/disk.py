@@ -15,7 +15,8 @@ __all__ = ["explain", "is_closed", "is_of_the_disk", "opening", "require_room", 
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM)
-_OF_THE_DISK = (*_FULL, errno.EFBIG, errno.EROFS, errno.EIO)
+_TOO_MANY = (errno.EMFILE, errno.ENFILE)
+_OF_THE_DISK = (*_FULL, *_TOO_MANY, errno.EFBIG, errno.EROFS, errno.EIO)
 # Some file systems cannot set space aside.
 _UNKNOWN = (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS)
 _LAST_BYTES = 1 << 12
@@ -23,7 +24,7 @@ _UNFINISHED = re.compile(r"\.(.+)\.partial")
 
 
 def is_of_the_disk(error: OSError) -> bool:
-    """Whether an error is about space or permission, and not about a name or a program."""
+    """Whether an error is about space, permission or a limit, and not about a name or a program."""
     return error.errno in _OF_THE_DISK or (error.errno in _CLOSED and error.filename is not None)
 
 
@@ -49,6 +50,8 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
             f"{shown}: cannot be written, it is larger than files may be in this shell; raise the limit, "
             "with: ulimit -f unlimited"
         )
+    if error.errno in _TOO_MANY:
+        return f"{shown}: {str(error.strerror).lower()}; raise the limit, with: ulimit -n 1024"
     if error.errno == errno.EROFS:
         return f"{shown}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
     if error.errno in _CLOSED:

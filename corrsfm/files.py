@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import stat
+import sys
 import unicodedata
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,6 +32,7 @@ __all__ = [
     "read_lines",
     "read_text",
     "require_file",
+    "require_replaceable",
     "sha256_of",
     "share_file",
     "sync_folder",
@@ -239,6 +241,9 @@ def open_file(path: Path) -> io.BufferedReader:
     except PermissionError as error:
         raise InputError(explain(error)) from error
     except OSError as error:
+        # Not the fault of the file, whose removal would be advised.
+        if is_of_the_disk(error):
+            raise
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
@@ -291,6 +296,31 @@ def read_json(path: Path) -> Any:
         raise ValueError("nested too deep") from error
 
 
+def require_replaceable(path: Path, what: str, *beginnings: bytes) -> None:
+    """Refuse to replace a file of another kind, such as a photo that an option was meant to come before.
+
+    Parameters
+    ----------
+    path : Path
+        Where a file is to be written; need not exist.
+    what : str
+        The kind of file that is written, with its article.
+    beginnings : bytes
+        One of which files of that kind begin with.
+
+    Raises
+    ------
+    InputError
+        If another file is there, or it cannot be read.
+    """
+    if not path.is_file():
+        return
+    with open_file(path) as file:
+        head = file.read(max(map(len, beginnings)))
+    if head and not head.startswith(beginnings):
+        raise InputError(f"{path}: exists and is not {what}; choose another name, or remove it")
+
+
 def why_unusable(path: str) -> str:
     """What is wrong with a path whatever is there; empty if nothing."""
     if not path:
@@ -298,6 +328,8 @@ def why_unusable(path: str) -> str:
     try:
         path.encode("utf-8")
     except UnicodeEncodeError:
+        if sys.getfilesystemencoding() != "utf-8":
+            return f"cannot be read in this locale ({sys.getfilesystemencoding()}); set LC_ALL=C.UTF-8"
         return "is not valid UTF-8; rename it"
     if any(unicodedata.category(character) == "Cc" for character in path):
         return "holds a line break or another control character; rename it"

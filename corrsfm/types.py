@@ -108,6 +108,12 @@ class ImageRecord:
     mask_sha256: str | None = None
     gps: tuple[float, float, float] | None = None
 
+    def __post_init__(self) -> None:
+        # A list may come from anybody, and what is exported is written under these names.
+        for name in (self.name, self.mask):
+            if name is not None and (not name or name.startswith("/") or ".." in name.split("/")):
+                raise InputError(f"'{name}' does not name a file below a folder")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Features:

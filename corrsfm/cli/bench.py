@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from corrsfm.cli.options import PATH, echo_json, json_option, run_options
+from corrsfm.cli.options import PATH, RESULT_FILE, echo_json, json_option, run_options
 from corrsfm.config import Precision, RunConfig
 
 __all__ = ["bench"]
@@ -53,7 +53,7 @@ __all__ = ["bench"]
     "--repeats", type=click.IntRange(min=1), default=3, show_default=True, help="Timed repetitions."
 )
 @run_options
-@click.option("--results", type=PATH, help="Also write a result file here.")
+@click.option("--results", type=RESULT_FILE, help="Also write a result file here.")
 @json_option
 def bench(
     model: Path | None,

@@ -11,6 +11,7 @@ from click.core import ParameterSource
 from corrsfm.cli.evaluate import command_line
 from corrsfm.cli.options import (
     PATH,
+    RESULT_FILE,
     echo_json,
     json_option,
     overwrite_option,
@@ -40,7 +41,7 @@ __all__ = ["compare"]
     help="Folder for workspaces, compare.json and compare.html. [default: compare_IMAGES]",
 )
 @click.option("--ground-truth", type=PATH, help="COLMAP model or folder of camera files to measure against.")
-@click.option("--results", type=PATH, help="Also write the result file here.")
+@click.option("--results", type=RESULT_FILE, help="Also write the result file here.")
 @seeds_option
 @functools.partial(pipeline_options, several_methods=True)
 @overwrite_option

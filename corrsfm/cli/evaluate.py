@@ -10,7 +10,15 @@ from typing import Any
 
 import click
 
-from corrsfm.cli.options import PATH, echo_json, json_option, overwrite_option, run_options, seeds_option
+from corrsfm.cli.options import (
+    PATH,
+    RESULT_FILE,
+    echo_json,
+    json_option,
+    overwrite_option,
+    run_options,
+    seeds_option,
+)
 from corrsfm.config import RunConfig
 
 __all__ = ["command_line", "evaluate"]
@@ -23,7 +31,7 @@ ESTIMATORS = (
     "ransac, usac, accurate, magsac, prosac, degensac, colmap, poselib or w8pt, with :PIXELS if wanted"
 )
 results_option = click.option(
-    "--results", type=PATH, help="Result file; what it holds already is not measured again."
+    "--results", type=RESULT_FILE, help="Result file; what it holds already is not measured again."
 )
 
 

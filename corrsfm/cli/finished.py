@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from corrsfm import config as cfg
-from corrsfm.cli.options import PATH, echo_json, json_option, run_options
+from corrsfm.cli.options import CSV_FILE, PATH, echo_json, json_option, run_options
 from corrsfm.errors import first_few, printable
 
 __all__ = ["add", "localize", "show_workspace"]
@@ -65,7 +65,7 @@ def add(
 @click.command()
 @click.argument("workspace_dir", metavar="WORKSPACE", type=PATH)
 @click.argument("photos", metavar="QUERY", nargs=-1, required=True, type=PATH)
-@click.option("--csv", "csv_file", type=PATH, help="Also write the poses to this file, a line a photo.")
+@click.option("--csv", "csv_file", type=CSV_FILE, help="Also write the poses to this file, a line a photo.")
 @click.option(
     "--camera-params",
     default="",

@@ -22,7 +22,7 @@ from corrsfm.config.fields import flag_of
 from corrsfm.disk import is_closed, opening
 from corrsfm.errors import InputError, printable
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
-from corrsfm.files import why_unusable
+from corrsfm.files import require_replaceable, why_unusable
 
 __all__ = [
     "OVERWRITE_KEY",
@@ -65,6 +65,27 @@ class _PathType(click.Path):
 
 PATH = _PathType(path_type=Path)
 """The type of every argument and option that is a path."""
+
+
+class _OutputType(_PathType):
+    """The path of a file to write, which may replace one of its kind, but no other."""
+
+    def __init__(self, what: str, *beginnings: bytes) -> None:
+        super().__init__(path_type=Path)
+        self._kind = what, beginnings
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = super().convert(value, param, ctx)
+        what, beginnings = self._kind
+        require_replaceable(path, what, *beginnings)
+        return path
+
+
+CHECKPOINT_FILE = _OutputType("a checkpoint", b"PK")
+CSV_FILE = _OutputType("a table of poses", b"name,")
+PAIR_FILE = _OutputType("a file of labelled pairs", b"\x89HDF")
+PNG_FILE = _OutputType("a PNG", b"\x89PNG")
+RESULT_FILE = _OutputType("a result file", b'{\n "format_version"')
 
 
 F = typing.TypeVar("F", bound=Callable[..., Any])

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from corrsfm.cli.options import PATH, config_options, recipe_options, usage_options
+from corrsfm.cli.options import (
+    CHECKPOINT_FILE,
+    PAIR_FILE,
+    PATH,
+    PNG_FILE,
+    config_options,
+    recipe_options,
+    usage_options,
+)
 from corrsfm.training.config import PrepareConfig
 
 if TYPE_CHECKING:
@@ -28,7 +36,7 @@ def train() -> None:
 
 @train.command()
 @click.argument("scenes", nargs=-1, required=True, type=PATH)
-@click.option("--output", required=True, type=PATH, help="File of labelled pairs to write.")
+@click.option("--output", required=True, type=PAIR_FILE, help="File of labelled pairs to write.")
 @click.option(
     "--splits", type=PATH, help="JSON with scene names by split; SCENES is then the folder that holds them."
 )
@@ -94,7 +102,7 @@ def _echo_row(row: dict[str, Any]) -> None:
 
 @train.command()
 @click.argument("source", metavar="RUN", type=PATH)
-@click.argument("output", type=PATH)
+@click.argument("output", type=CHECKPOINT_FILE)
 @click.option("--half/--no-half", default=True, show_default=True, help="Store in half precision.")
 @usage_options
 def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsage], NetworkUsage]) -> None:
@@ -104,9 +112,12 @@ def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsag
     operating points stay as they are but for the flags given here; the defaults are those of a checkpoint
     that says nothing.
     """
+    from corrsfm.errors import InputError
     from corrsfm.model import load_network, read_provenance, save_network
 
     checkpoint = source / "latest.pt" if source.is_dir() else source
+    if output.exists() and output.samefile(checkpoint):
+        raise InputError(f"{output}: is what is exported; choose another name")
     network = load_network(checkpoint)
     network.usage = adjust(network.usage)
     digest = save_network(network, output, provenance=read_provenance(checkpoint), half=half)
@@ -118,7 +129,7 @@ def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsag
 @click.option(
     "--pairs", "pair_files", multiple=True, type=PATH, help="Pair files to compare with synthetic pairs."
 )
-@click.option("--output", required=True, type=PATH, help="PNG to write.")
+@click.option("--output", required=True, type=PNG_FILE, help="PNG to write.")
 def plots(run_folder: Path | None, pair_files: tuple[Path, ...], output: Path) -> None:
     """Draw the learning curves of a run, or a page that compares real and synthetic pairs."""
     if (run_folder is None) == (not pair_files):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -125,7 +126,9 @@ def export_scene(
     source, target = Workspace(Path(workspace)), _target_of(target)
     with source.reading():
         _require_model(source, needs_features=target is ExportTarget.HLOC)
-        return _export_models(source, Path(output), target, images_dir, upright, scale, crop)
+        # Not in place of a link, which may lead to a larger disk.
+        path = Path(output).resolve() if os.path.islink(output) else Path(output)
+        return _export_models(source, path, target, images_dir, upright, scale, crop)
 
 
 def _export_models(

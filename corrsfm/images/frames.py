@@ -7,6 +7,7 @@ as the video is the same. ``frames.json`` is written last: without it the folder
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from corrsfm.errors import InputError, WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.files import FRAME_TIMES, OWN_RECORD, atomic_path, atomic_write_json, read_json, sha256_of
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 
@@ -119,7 +120,7 @@ def extract_frames(
             "its width: fewer than two frames to reconstruct from; film while you walk, or try --every 0.1s"
         )
     try:
-        _write(video, folder, frames, {"frames": num_frames, "every": every}, track)
+        _write(video, folder, frames, {"frames": num_frames, "every": every}, hash_of, track)
     except OSError as error:
         raise WorkspaceError(f"{folder}: frames cannot be written ({error.strerror})") from error
     if len(frames) < num_frames:
@@ -178,9 +179,16 @@ def _frames_in(folder: Path) -> set[str]:
     return {path.name for path in folder.glob("frame_*.jpg")}
 
 
-def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str, Any], track: Track) -> None:
+def _write(
+    video: Path,
+    folder: Path,
+    frames: Sequence[Frame],
+    options: dict[str, Any],
+    hash_of: Callable[[Path], str],
+    track: Track,
+) -> None:
     """Bring a folder to exactly these frames, and record them."""
-    record = {
+    record: dict[str, Any] = {
         "video": str(video.resolve()),
         "options": options,
         "frames": [dataclasses.asdict(frame) for frame in frames],
@@ -188,10 +196,15 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
     there = _frames_in(folder)
     try:
         before = read_json(folder / FRAME_TIMES)
-    except (OSError, ValueError):
-        before = None
+        hashes = dict(before.get("sha256", {}))
+    except (OSError, ValueError, TypeError, AttributeError):
+        before, hashes = None, {}
+    if changed := sorted(name for name in there & hashes.keys() if hash_of(folder / name) != hashes[name]):
+        logger.warning("%s: have changed and are taken from the video again: %s", folder, first_few(changed))
+        there -= set(changed)
     wanted = {frame.name for frame in frames}
     missing = [frame for frame in frames if frame.name not in there]
+    record["sha256"] = {name: hashes[name] for name in sorted(there & wanted & hashes.keys())}
     if before == record and there == wanted:
         return
     if before is not None and before.get("options") != options:
@@ -214,4 +227,5 @@ def _write(video: Path, folder: Path, frames: Sequence[Frame], options: dict[str
         _, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
         with atomic_path(folder / by_number[number].name) as temporary:
             temporary.write_bytes(encoded.tobytes())
+        record["sha256"][by_number[number].name] = hashlib.sha256(encoded.tobytes()).hexdigest()
     atomic_write_json(folder / FRAME_TIMES, record)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from corrsfm.errors import InputError, first_few
-from corrsfm.files import read_lines
+from corrsfm.files import read_lines, why_unusable
 from corrsfm.images.photos import CONVERTED_SUFFIXES
 
 __all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "find_masks", "holds_pictures", "list_images", "photos_below"]
@@ -80,9 +80,8 @@ def list_images(
         where = str(image_list)
     unprintable = [name for name in names if not _is_utf8(name)]
     if unprintable:
-        raise InputError(
-            f"{folder}: names are not valid UTF-8: {first_few(map(repr, unprintable))}; rename them"
-        )
+        why = why_unusable(unprintable[0])
+        raise InputError(f"{folder}: {first_few(map(repr, unprintable))}: {why}")
     separating = [name for name in names if _CONTROL.search(name)]
     if separating:
         raise InputError(
@@ -203,6 +202,9 @@ def find_masks(mask_dir: Path | None, folder: Path, names: Sequence[str]) -> lis
     if not mask_dir.is_dir():
         raise InputError(f"{mask_dir}: no such folder; expected the folder with the masks")
     masks = [f"{name}.png" if (mask_dir / f"{name}.png").is_file() else None for name in names]
+    places = [mask_dir / f"{name}.png" for name in names]
+    if broken := [path.name for path in places if path.is_symlink() and not path.exists()]:
+        raise InputError(f"{mask_dir}: links that lead nowhere: {first_few(broken)}; mend or remove them")
     rule = f"the mask of '{names[0]}' must be '{names[0]}.png'"
     if not any(masks):
         raise InputError(f"{mask_dir}: no mask for any photo; {rule}")

@@ -37,7 +37,9 @@ def open_database(path: Path, *, with_matches: bool) -> Iterator[DatabaseSource]
         raise InputError(f"{path}: damaged, its end is missing; copy or make it again")
     try:
         # As URI, because a name may hold a question mark or a hash.
-        uri = f"{path.absolute().as_uri()}?mode=ro"
+        # Without a log beside it nobody writes, and reading it as unchangeable leaves no log there either.
+        in_use = any(path.with_name(path.name + suffix).exists() for suffix in ("-wal", "-journal"))
+        uri = f"{path.absolute().as_uri()}?{'mode=ro' if in_use else 'immutable=1'}"
         with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
             yield DatabaseSource(path, connection, with_matches=with_matches)
     except sqlite3.Error as error:

@@ -78,7 +78,9 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
     try:
         state = torch.load(path, map_location=device, weights_only=True)
     except (OSError, RuntimeError, pickle.UnpicklingError, EOFError) as error:
-        raise CheckpointError(f"{path}: cannot be read as the state of a training run ({error})") from error
+        raise CheckpointError(
+            f"{path}: damaged, or not the state of a training run; start again, without --resume"
+        ) from error
     if not isinstance(state, dict) or state.get("format") != _FORMAT:
         raise CheckpointError(f"{path}: not the state of a training run; start without --resume")
     return state

@@ -167,6 +167,8 @@ def _prepared(
     """Prepare scenes one by one, and note each in ``done``."""
     for folder in scenes:
         scene = prepare_scene(folder, config)
+        if scene.name in [name for name, _ in done]:
+            raise InputError(f"{folder}: a scene called {scene.name} is in this file already; name each once")
         done.append((scene.name, len(scene.pairs)))
         yield scene
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from corrsfm.colmap.models import read_models
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import WorkspaceError, first_few
 from corrsfm.workspace.folder import Workspace
+from corrsfm.workspace.lists import read_index
 
 if TYPE_CHECKING:
     import pycolmap
@@ -70,7 +71,20 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
             remedy = workspace.command_for("models", "--overwrite")
             raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")
         logger.warning("%s: changed since corrsfm wrote it; it is used as it is", folder)
-    return read_models(workspace.sparse)
+    models = read_models(workspace.sparse)
+    _require_known_photos(workspace, models)
+    return models
+
+
+def _require_known_photos(workspace: Workspace, models: Iterable[pycolmap.Reconstruction]) -> None:
+    """Refuse models of photos that the scene does not hold: their names may lead anywhere."""
+    known = set(read_index(workspace).names)
+    if strange := sorted({image.name for model in models for image in model.images.values()} - known):
+        remedy = workspace.command_for("models", "--overwrite")
+        raise WorkspaceError(
+            f"{workspace.sparse}: holds photos that this scene does not: {first_few(strange)}; name them as "
+            f"the scene does, or make the models again with: {remedy}"
+        )
 
 
 def _can_be_read(folder: Path) -> bool:

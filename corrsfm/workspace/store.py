@@ -57,7 +57,8 @@ _NOT_DAMAGE = {
     ),
     ("SQLITE_NOMEM",): "not enough memory ({}); close other programs and run again, finished work is kept",
     ("SQLITE_FULL", "SQLITE_IOERR"): (
-        "the disk is full or failing ({}); free some space and run again, finished work is kept"
+        "the disk is full or failing, or the file larger than this shell allows ({}); free some space, see "
+        "ulimit -f, and run again, finished work is kept"
     ),
 }
 
