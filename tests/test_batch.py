@@ -17,7 +17,7 @@ from photos import write_photos
 from corrsfm import batch
 from corrsfm.batch import find_scenes, run_collection, run_one
 from corrsfm.cli import main
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.report import make_report
 
 
@@ -173,6 +173,13 @@ def test_what_befalls_a_scene_is_its_row_and_the_others_go_on(
         "b.batch.log: cannot be written (Is a directory); the scene was not run"
     )
     assert statuses[2].message.startswith("Error: ZeroDivisionError: ")
+
+
+def test_a_collection_is_not_its_own_output(tmp_path: Path) -> None:
+    photos = collection(tmp_path, *"ab")
+    with pytest.raises(InputError, match=r"is the collection itself; choose another folder, such as .*/out$"):
+        run_collection(photos, tmp_path / "collection" / ".." / "collection")
+    assert sorted(path.name for path in photos.iterdir()) == ["a", "b"]
 
 
 def test_a_pipe_in_place_of_a_log_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

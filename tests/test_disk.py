@@ -69,3 +69,9 @@ def test_a_link_in_place_of_the_scratch_file_is_not_written_through(tmp_path: Pa
     (folder / ".room.0.partial").symlink_to(mine)
     require_room(folder, 100)
     assert mine.read_text() == "kept" and os.listdir(folder) == []
+
+
+def test_too_many_open_files_are_a_matter_of_the_shell() -> None:
+    error = OSError(errno.EMFILE, "Too many open files", "scene/features.db")
+    assert is_of_the_disk(error)
+    assert explain(error) == ("scene/features.db: too many open files; raise the limit, with: ulimit -n 1024")

@@ -7,7 +7,14 @@ from pathlib import Path
 import pytest
 
 from corrsfm.errors import InputError, WorkspaceError
-from corrsfm.files import atomic_path, atomic_write_text, read_lines, sha256_of, share_file
+from corrsfm.files import (
+    atomic_path,
+    atomic_write_text,
+    read_lines,
+    require_replaceable,
+    sha256_of,
+    share_file,
+)
 
 
 def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
@@ -134,3 +141,14 @@ def test_places_where_nothing_can_be_written_are_named(tmp_path: Path) -> None:
     for path in (tmp_path / "file" / "x", Path("."), tmp_path):
         with pytest.raises(WorkspaceError, match="cannot be|is a folder"):
             atomic_write_text(path, "x")
+
+
+def test_a_file_is_replaced_by_one_of_its_kind_alone(tmp_path: Path) -> None:
+    path = tmp_path / "results.json"
+    require_replaceable(path, "a result file", b"{")
+    for content in (b"", b'{"a": 1}'):
+        path.write_bytes(content)
+        require_replaceable(path, "a result file", b"{", b"[")
+    path.write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(InputError, match=r"results\.json: exists and is not a result file; choose another"):
+        require_replaceable(path, "a result file", b"{", b"[")

@@ -73,8 +73,11 @@ def check(
     from corrsfm.config import PipelineConfig, RunConfig
     from corrsfm.files import atomic_write_text
     from corrsfm.images.check import check_photos
+    from corrsfm.images.listing import require_list
     from corrsfm.machine import count_threads
 
+    if keep is not None:
+        require_list(keep)
     result = check_photos(photos, mask_dir=mask_dir, threads=count_threads(threads))
     expected = None
     if forecast and len(result.kept) > 1:

@@ -7,12 +7,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import pycolmap
-
 from corrsfm import config as cfg
 from corrsfm.colmap.cameras import camera_from_pycolmap, with_focal_length
-from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import database_errors
+from corrsfm.colmap.sqlite import open_for_reading
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import sha256_of
 from corrsfm.images.cache import PhotoCache
@@ -109,8 +106,8 @@ def cameras_of_new(workspace: Workspace, index: Index, new: Sequence[str]) -> di
     """
     models = models_of(workspace)
     path = workspace.database
-    with colmap_log(), database_errors(path), pycolmap.Database.open(path) as database:
-        used = {camera.camera_id for camera in database.read_all_cameras()}
+    with open_for_reading(path) as database:
+        used = {number for (number,) in database.execute("SELECT camera_id FROM cameras")}
     free = max({*used, *(i for model in models for i in model.cameras)}, default=0) + 1
     records = {record.name: record for record in index.records}
     own: dict[int, int] = {}

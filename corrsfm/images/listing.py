@@ -13,7 +13,15 @@ from corrsfm.errors import InputError, first_few
 from corrsfm.files import read_lines, why_unusable
 from corrsfm.images.photos import CONVERTED_SUFFIXES
 
-__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "find_masks", "holds_pictures", "list_images", "photos_below"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "VIDEO_SUFFIXES",
+    "find_masks",
+    "holds_pictures",
+    "list_images",
+    "photos_below",
+    "require_list",
+]
 
 IMAGE_SUFFIXES = (".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp", *CONVERTED_SUFFIXES)
 VIDEO_SUFFIXES = (".3gp", ".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpeg", ".mpg", ".mts", ".webm", ".wmv")
@@ -213,6 +221,18 @@ def find_masks(mask_dir: Path | None, folder: Path, names: Sequence[str]) -> lis
         subject = "1 mask belongs" if len(stray) == 1 else f"{len(stray)} masks belong"
         logger.warning("%s: %s to no photo: %s; %s", mask_dir, subject, first_few(stray), rule)
     return masks
+
+
+def require_list(path: Path) -> None:
+    """Refuse to write a list of photos in place of a file that is none.
+
+    Raises
+    ------
+    InputError
+        If there is such a file.
+    """
+    if path.is_file() and not all(line.lower().endswith(IMAGE_SUFFIXES) for line in read_lines(path)):
+        raise InputError(f"{path}: exists and is not a list of photos; choose another name, or remove it")
 
 
 def _stray_masks(mask_dir: Path, folder: Path) -> list[str]:

@@ -14,6 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.colmap.sqlite import open_for_reading
+
 __all__ = [
     "adjust",
     "adjusted_cost",
@@ -199,7 +201,7 @@ def restore_priors(model: pycolmap.Reconstruction, database: Path) -> None:
         Changed in place. Cameras that the database does not hold are copies of ones of unknown focal length.
     database : Path
     """
-    with pycolmap.Database.open(database) as tables:
-        has_prior = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
+    with open_for_reading(database) as tables:
+        has_prior = dict(tables.execute("SELECT camera_id, prior_focal_length FROM cameras"))
     for camera_id, camera in model.cameras.items():
-        camera.has_prior_focal_length = has_prior.get(camera_id, False)
+        camera.has_prior_focal_length = bool(has_prior.get(camera_id, False))

@@ -6,6 +6,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from corrsfm.cli import main
 from corrsfm.cli.options import config_options, pipeline_options
 from corrsfm.config import PairsConfig, PipelineConfig, PruneConfig
 
@@ -72,3 +73,27 @@ def test_no_option_of_pruning_is_idle_where_methods_are_compared(caplog: pytest.
     result = CliRunner().invoke(command, ["--max-ratio", "0.7", "--num-spatial", "3"])
     assert result.exit_code == 0, result.output
     assert caplog.messages == ["--num-spatial: no effect with --pairing auto"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "check photos --no-forecast --keep mine.jpg",
+        "localize scene photos/a.jpg --csv mine.jpg",
+        "train prepare photos --output mine.jpg",
+        "train export net.pt mine.jpg",
+        "train plots --run runs --output mine.jpg",
+        "bench --results mine.jpg",
+        "compare photos out --results mine.jpg",
+        "evaluate pose pairs.h5 --results mine.jpg",
+    ],
+)
+def test_a_photo_in_the_place_of_a_result_is_not_replaced(
+    words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.jpg").write_bytes(b"\xff\xd8\xff mine")
+    result = CliRunner().invoke(main, words.split())
+    assert result.exit_code == 1, result.output
+    assert "mine.jpg: " in result.output
+    assert Path("mine.jpg").read_bytes() == b"\xff\xd8\xff mine"

@@ -66,6 +66,14 @@ def test_a_file_is_not_overwritten(scene: FinishedScene, tmp_path: Path) -> None
     assert (tmp_path / "poses.csv").read_text() == "mine"
 
 
+def test_what_a_link_leads_to_is_filled_and_the_link_stays(scene: FinishedScene, tmp_path: Path) -> None:
+    (tmp_path / "large").mkdir()
+    (tmp_path / "out").symlink_to("large")
+    export_scene(scene.workspace, tmp_path / "out", "splat")
+    assert (tmp_path / "out").is_symlink()
+    assert (tmp_path / "large" / "sparse" / "0" / "cameras.bin").exists()
+
+
 def test_an_empty_folder_is_filled(scene: FinishedScene, tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     export_scene(scene.workspace, tmp_path / "out", "splat")

@@ -144,6 +144,21 @@ def test_an_interrupted_extraction_leaves_whole_frames_and_goes_on(tmp_path: Pat
     assert measured_at == (folder / ".corrsfm.json").stat().st_mtime_ns
 
 
+def test_a_frame_that_changed_is_taken_from_the_video_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, folder = write_video(tmp_path / "a.avi", sliding(20)), tmp_path / "frames"
+    frames = extract_frames(path, folder, num_frames=6)
+    before = {frame.name: (folder / frame.name).read_bytes() for frame in frames}
+    (folder / frames[1].name).write_bytes(before[frames[2].name])
+    (folder / frames[4].name).write_bytes(b"x")
+    assert extract_frames(path, folder, num_frames=6) == frames
+    assert {frame.name: (folder / frame.name).read_bytes() for frame in frames} == before
+    assert f"taken from the video again: {frames[1].name}, {frames[4].name}" in caplog.text
+    (folder / "frames.json").write_text("{}")
+    assert extract_frames(path, folder, num_frames=6) == frames
+
+
 def test_a_changed_option_chooses_again_and_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path, folder = write_video(tmp_path / "a.avi", sliding(20)), tmp_path / "frames"
     caplog.set_level("INFO")

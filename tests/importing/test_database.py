@@ -1,5 +1,6 @@
 """A COLMAP database comes in as it is and is not changed."""
 
+import contextlib
 import shutil
 import sqlite3
 from pathlib import Path
@@ -56,6 +57,17 @@ def test_a_database_in_a_folder_with_an_odd_name_is_read(
     folder.mkdir()
     write_old_database(folder / "database.db", names)
     assert import_features(photos, tmp_path / "scene", database=folder / "database.db").num_pairs == 1
+
+
+def test_nothing_is_left_beside_a_database(photos: Path, names: list[str], tmp_path: Path) -> None:
+    (tmp_path / "own").mkdir()
+    path = tmp_path / "own" / "database.db"
+    write_old_database(path, names)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute("PRAGMA journal_mode = WAL")
+    before = path.read_bytes()
+    import_features(photos, tmp_path / "scene", database=path)
+    assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
 
 
 def test_matches_may_be_left(photos: Path, names: list[str], tmp_path: Path) -> None:

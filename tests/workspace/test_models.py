@@ -30,6 +30,18 @@ def test_a_model_that_another_program_adjusted_is_used_with_a_warning(
     assert again.num_points3D() == model.num_points3D()
 
 
+@pytest.mark.parametrize("name", ["../../mine.jpg", "/tmp/mine.jpg", "unknown.jpg"])
+def test_a_model_of_photos_that_the_scene_does_not_hold_is_refused(workspace: Workspace, name: str) -> None:
+    (model,) = models_of(workspace)
+    next(iter(model.images.values())).name = name
+    model.write_binary(workspace.sparse / "0")
+    # Whoever sends a workspace may make its record fit.
+    for _ in range(2):
+        with pytest.raises(WorkspaceError, match=f"does not: {name}; name them as the scene does"):
+            models_of(workspace)
+        workspace.finish("models", StageRecord(fingerprint="made up"))
+
+
 @pytest.mark.parametrize("name", ["cameras.bin", "frames.bin", "images.bin", "points3D.bin", "rigs.bin"])
 @pytest.mark.parametrize("way", ["cut", "noise", "count"])
 def test_a_damaged_model_is_named_with_the_command_that_makes_it_again(
