@@ -127,7 +127,8 @@ def export_scene(
     with source.reading():
         _require_model(source, needs_features=target is ExportTarget.HLOC)
         # Not in place of a link, which may lead to a larger disk.
-        path = Path(output).resolve() if os.path.islink(output) else Path(output)
+        leads_on = os.path.islink(output) and os.path.isdir(output)
+        path = Path(output).resolve() if leads_on else Path(output)
         return _export_models(source, path, target, images_dir, upright, scale, crop)
 
 

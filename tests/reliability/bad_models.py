@@ -11,6 +11,7 @@ from place import Place
 
 __all__ = ["cases"]
 
+TARGETS = ("splat", "nerfstudio", "colmap", "colmap3", "openmvs", "bundler", "hloc", "csv", "localize")
 COMMANDS = ("prepare", "covisible", "score", "compare")
 
 
@@ -21,6 +22,32 @@ def cases() -> Iterator[Case]:
             yield Case(
                 name=f"model {command} {label}", prepare=lambda place, s=spoil, c=command: _trial(place, s, c)
             )
+
+    for name in ("../../mine.jpg", "../mine.jpg", "/absolute/mine.jpg", "unknown.jpg", ""):
+        for target in TARGETS:
+            yield Case(
+                name=f"model of {name or 'no name'} for {target}",
+                prepare=lambda place, n=name, t=target: _strange_photo(place, n, t),
+            )
+
+
+def _strange_photo(place: Place, name: str, target: str) -> Trial:
+    """A photo of the model is called by a path of something else, which must stay as it is."""
+    import pycolmap
+
+    scene = place.scene()
+    mine = place.file("photos/below/mine.jpg", (place.base / "photos" / "1.jpg").read_bytes())
+    place.file("mine.jpg", b"mine")
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    image = min(model.images.values(), key=lambda one: one.name)
+    image.name = str(mine) if name.startswith("/") else name
+    model.write_binary(scene / "sparse" / "0")
+    words = (
+        ["localize", str(scene), "photos/1.jpg"]
+        if target == "localize"
+        else ["export", str(scene), "out", "--for", target]
+    )
+    return Trial(arguments=words, named=["sparse"], writes=["out"])
 
 
 def _cut(share: float) -> Callable[[bytes], bytes]:

@@ -39,10 +39,46 @@ def cases() -> Iterator[Case]:
     for label, text in _tables().items():
         yield Case(name=f"toml run {label}", prepare=lambda place, t=text: _toml(place, t, training=False))
         yield Case(name=f"toml train {label}", prepare=lambda place, t=text: _toml(place, t, training=True))
+    for label, words in OUTPUTS.items():
+        for victim in VICTIMS:
+            yield Case(
+                name=f"output {label} over {victim}",
+                prepare=lambda place, w=words, v=victim: _output(place, w, v),
+            )
     for label, words in _cameras().items():
         yield Case(name=f"camera {label}", prepare=lambda place, w=words: _camera(place, w))
     for label, words in _scales().items():
         yield Case(name=f"export {label}", prepare=lambda place, w=words: _export(place, w))
+
+
+OUTPUTS = {
+    "keep": ["check", "photos", "--no-forecast", "--keep"],
+    "csv": ["localize", "scene", "photos/1.jpg", "--threads", "1", "--csv"],
+    "export csv": ["export", "scene", "--for", "csv"],
+    "export ply": ["export", "scene", "--for", "ply"],
+    "pairs": ["train", "prepare", "photos", "--output"],
+    "checkpoint": ["train", "export", "net.pt"],
+    "plots": ["train", "plots", "--pairs", "pairs.h5", "--output"],
+    "bench": ["bench", "--num-matches", "32", "--results"],
+    "compare": ["compare", "photos", "--methods", "ratio", "--results"],
+    "evaluate": ["evaluate", "pose", "pairs.h5", "--method", "mutual/poselib", "--results"],
+}
+"""Commands that write a file, whose name comes last."""
+VICTIMS = (
+    "photos/0.jpg",
+    "scene/features.db",
+    "scene/database.db",
+    "scene/images.json",
+    "scene/sparse/0/images.bin",
+)
+
+
+def _output(place: Place, words: list[str], victim: str) -> Trial:
+    """A file of another kind has the name of what is to be written."""
+    place.scene()
+    for name in ("net.pt", "pairs.h5"):
+        place.file(name, (place.base / name).read_bytes())
+    return Trial(arguments=[*words, victim], named=[victim.split("/")[-1], "sparse"], writes=["scene/.lock"])
 
 
 def _number(place: Place, words: str, parameter: click.Parameter, value: str) -> Trial:
