@@ -72,6 +72,8 @@ def is_closed(path: Path | str) -> bool:
 
 def opening(path: Path) -> str:
     """What keeps a path from being read and written, perhaps a folder on the way, and what opens it."""
+    if not os.path.lexists(path) and os.access(_nearest(path), os.W_OK | os.X_OK):
+        return f"{path}: is not there any more; put it back, or run the command again"
     closed, what, mode = _closed(path)
     if mode == "w" and closed.exists() and os.statvfs(closed).f_flag & os.ST_RDONLY:
         return (
@@ -91,14 +93,18 @@ def _closed(path: Path) -> tuple[Path, str, str]:
             return folder, "may not be entered", "rwX"
     if not os.path.lexists(path):
         # Not there yet: whoever makes it writes into what is there.
-        folder = next((parent for parent in path.parents if parent.exists()), path)
-        return folder, "nothing may be written in it", "w"
+        return _nearest(path), "nothing may be written in it", "w"
     is_folder = stat.S_ISDIR(path.stat().st_mode)
     if not os.access(path, os.R_OK | (os.X_OK if is_folder else 0)):
         return path, "may not be read", "rwX" if is_folder else "r"
     if not os.access(path, os.W_OK):
         return path, "nothing may be written in it" if is_folder else "may not be written", "w"
     return path.parent, "nothing may be changed in it", "w"
+
+
+def _nearest(path: Path) -> Path:
+    """The folder above a path that is there."""
+    return next((parent for parent in path.parents if parent.exists()), path)
 
 
 def _finished_name(path: Path) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from corrsfm.disk import explain, is_of_the_disk, require_room, room_for
+from corrsfm.disk import explain, is_of_the_disk, opening, require_room, room_for
 
 
 def test_a_full_disk_is_named_by_what_was_to_be_written(tmp_path: Path) -> None:
@@ -17,6 +17,10 @@ def test_a_full_disk_is_named_by_what_was_to_be_written(tmp_path: Path) -> None:
     assert explain(error, tmp_path / ".out.partial" / "images").startswith(
         f"{tmp_path / 'out'}: cannot be written, the disk is full"
     )
+
+
+def test_what_vanished_is_not_taken_for_closed(tmp_path: Path) -> None:
+    assert opening(tmp_path / "scene").startswith(f"{tmp_path / 'scene'}: is not there any more;")
 
 
 def test_a_name_that_is_missing_is_no_matter_of_the_disk() -> None:
