@@ -72,7 +72,8 @@ def is_closed(path: Path | str) -> bool:
 
 def opening(path: Path) -> str:
     """What keeps a path from being read and written, perhaps a folder on the way, and what opens it."""
-    if not os.path.lexists(path) and os.access(_nearest(path), os.W_OK | os.X_OK):
+    is_way_open = all(os.access(folder, os.X_OK) for folder in path.parents if folder.exists())
+    if is_way_open and not os.path.lexists(path) and os.access(_nearest(path), os.W_OK):
         return f"{path}: is not there any more; put it back, or run the command again"
     closed, what, mode = _closed(path)
     if mode == "w" and closed.exists() and os.statvfs(closed).f_flag & os.ST_RDONLY:
