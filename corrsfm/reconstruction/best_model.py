@@ -211,6 +211,7 @@ def select_model(
         )
 
     bank = candidate_bank(seed=seed, on_trial=cameras_on_trial)
+    cameras_of = {candidate.name: candidate.cameras for candidate in bank}
     with CandidatePool(
         database,
         workdir,
@@ -239,6 +240,7 @@ def select_model(
                 model.explained.misplaced,
                 database,
                 workdir / "again",
+                cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
                 seed=seed,
                 refine_principal_point=refine_principal_point,
             )

@@ -14,8 +14,14 @@ import pycolmap
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
-from corrsfm.colmap.sqlite import database_errors
-from corrsfm.reconstruction.candidates import Candidate, MapperKind, incremental_options
+from corrsfm.colmap.sqlite import copy_database, database_errors
+from corrsfm.reconstruction.candidates import (
+    Candidate,
+    MapperKind,
+    StartingCameras,
+    change_cameras,
+    incremental_options,
+)
 
 __all__ = ["register_again"]
 
@@ -26,6 +32,7 @@ def register_again(
     database: Path,
     workdir: Path,
     *,
+    cameras: StartingCameras = StartingCameras.AS_IS,
     seed: int = 0,
     refine_principal_point: bool = False,
     num_threads: int = 1,
@@ -42,6 +49,8 @@ def register_again(
         The verified matches that the model was made from; not changed.
     workdir : Path
         An empty or missing folder, removed at the end.
+    cameras : StartingCameras
+        What the model was mapped with in place of the cameras of the database.
     seed : int
     refine_principal_point : bool
     num_threads : int
@@ -68,6 +77,12 @@ def register_again(
     for folder in (given, found):
         folder.mkdir(parents=True)
     write_model(rest, given)
+    if cameras in (StartingCameras.SHARED, StartingCameras.SEPARATE):
+        # Those of the model, else pycolmap refuses it.
+        copy = workdir / "database.db"
+        copy_database(database, copy)
+        change_cameras(copy, cameras)
+        database = copy
     candidate = Candidate(mapper=MapperKind.RELAXED, seed=seed)
     options = incremental_options(candidate, refine_principal_point, num_threads)
     with colmap_log(), database_errors(database):

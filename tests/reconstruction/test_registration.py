@@ -7,6 +7,12 @@ from scene_of_points import bend
 from synthetic_database import synthesize
 
 from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.candidates import (
+    Candidate,
+    MapperKind,
+    StartingCameras,
+    map_candidate,
+)
 from corrsfm.reconstruction.registration import register_again
 from corrsfm.reconstruction.views import views_of
 
@@ -32,6 +38,23 @@ def test_a_misplaced_photo_finds_its_place(tmp_path: Path) -> None:
     assert (common.num_photos, common.share) == (8, 1.0)
     assert not (tmp_path / "work").exists()
     assert wrong.num_reg_images() == 8
+
+
+def test_a_model_of_other_cameras_than_the_database_s_is_gone_on_with(tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    truth = synthesize(path)
+    candidate = Candidate(mapper=MapperKind.INCREMENTAL, cameras=StartingCameras.SEPARATE)
+    model = map_candidate(candidate, path, tmp_path / "separate")
+    assert model is not None and len({image.camera_id for image in model.images.values()}) == 8
+    name = misplace(model, 3)
+    before = path.read_bytes()
+    again = register_again(model, [name], path, tmp_path / "work", cameras=StartingCameras.SEPARATE)
+    assert again is not None
+    assert agreement(views_of(again), views_of(truth)).share == 1.0
+    assert {image.name: image.camera_id for image in again.images.values()} == {
+        image.name: image.camera_id for image in model.images.values()
+    }
+    assert path.read_bytes() == before
 
 
 def test_a_photo_without_pairs_stays_out(tmp_path: Path) -> None:
