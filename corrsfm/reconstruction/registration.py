@@ -48,7 +48,7 @@ def register_again(
     database : Path
         The verified matches that the model was made from; not changed.
     workdir : Path
-        An empty or missing folder, removed at the end.
+        Made, and removed at the end.
     cameras : StartingCameras
         What the model was mapped with in place of the cameras of the database.
     seed : int
@@ -73,6 +73,8 @@ def register_again(
             rest.deregister_frame(image.frame_id)
     if rest.num_reg_images() < 2:
         return None
+    # What a kill has left of an earlier attempt.
+    shutil.rmtree(workdir, ignore_errors=True)
     given, found = workdir / "given", workdir / "found"
     for folder in (given, found):
         folder.mkdir(parents=True)

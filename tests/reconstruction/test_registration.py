@@ -32,6 +32,8 @@ def test_a_misplaced_photo_finds_its_place(tmp_path: Path) -> None:
     wrong = pycolmap.Reconstruction(truth)
     name = misplace(wrong, 3)
     assert agreement(views_of(wrong), views_of(truth)).share < 1.0
+    # As a kill may have left it.
+    (tmp_path / "work" / "given").mkdir(parents=True)
     again = register_again(wrong, [name], tmp_path / "database.db", tmp_path / "work")
     assert again is not None
     common = agreement(views_of(again), views_of(truth))
