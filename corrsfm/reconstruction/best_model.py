@@ -247,6 +247,8 @@ def select_model(
             if again is None:
                 return None
             name = model.name + _MENDED
+            # It may have photos to register once more.
+            cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
             return tried(name, again, first_seconds, has_more_cameras=model.has_more_cameras)
 
         start = None
