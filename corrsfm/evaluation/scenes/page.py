@@ -120,7 +120,7 @@ def _seeds(methods: dict[str, Any]) -> str:
             )
             for (_, value, spec), winner in zip(columns, best, strict=True)
         ]
-        medians.append(_row(_cell(name), *cells, _cell(grades_text(method["seeds"]))))
+        medians.append(_row(_cell(_short(name)), *cells, _cell(grades_text(method["seeds"]))))
         models += [_model(name, seed, columns) for seed in method["seeds"]]
     headings = [heading for heading, *_ in columns]
     note = (
@@ -141,13 +141,19 @@ def _model(
     cells = [_cell(f"{value(seed):{spec}}") for _, value, spec in columns]
     cells += [_cell(str(seed["num_contradicted_pairs"])), _cell(_number(seed["seconds"]["map"], 1))]
     verdict = grades_text([seed]).removeprefix("1 ")
-    row = _row(_cell(method), _cell(str(seed["seed"])), *cells, _cell(verdict))
+    row = _row(_cell(_short(method)), _cell(str(seed["seed"])), *cells, _cell(verdict))
     return row + _failure(seed["failure"], 3 + len(cells))
 
 
 def _auc_of(values: dict[str, Any]) -> dict[str, float]:
     """AUC by threshold of a summary over seeds, or of one seed."""
     return values["auc"] if "auc" in values else values["ground_truth"]["auc"]
+
+
+def _short(method: str) -> str:
+    """A method without the folders that its checkpoint lies in, but for the last, which may tell it."""
+    name, colon, checkpoint = method.partition(":")
+    return name + colon + "/".join(Path(checkpoint).parts[-2:])
 
 
 def _table(methods: dict[str, Any]) -> str:
@@ -169,7 +175,7 @@ def _table(methods: dict[str, Any]) -> str:
             )
             for (_, value, decimals, _), winner in zip(columns, best, strict=True)
         ]
-        rows.append(_row(_cell(name), *cells))
+        rows.append(_row(_cell(_short(name)), *cells))
         rows.append(_failure(method["failure"], len(columns) + 1))
     return _numbers(["method", *(heading for heading, *_ in columns)], rows)
 
@@ -236,7 +242,7 @@ def _drawn_pairs(
             kept, verified = row["kept_and_verified"][method]
             figures.append(
                 f"<figure><img src='{jpeg_uri(picture)}' class='wide' alt='matches kept by {escape(method)}'>"
-                f"<figcaption>{escape(method)}: {len(indices)} → {kept} kept → {verified} verified"
+                f"<figcaption>{escape(_short(method))}: {len(indices)} → {kept} kept → {verified} verified"
                 "</figcaption></figure>"
             )
         sections.append(

@@ -17,7 +17,7 @@ from corrsfm.cli import main
 from corrsfm.errors import ConfigError, InputError, ReconstructionError
 from corrsfm.evaluation.records import load_results
 from corrsfm.evaluation.scenes.compare import compare_methods, method_folder
-from corrsfm.evaluation.scenes.page import _table
+from corrsfm.evaluation.scenes.page import _short, _table
 from corrsfm.evaluation.scenes.sharing import share_stages
 from corrsfm.evaluation.tables import render_table
 from corrsfm.reconstruction import stage as reconstruction_stage
@@ -262,3 +262,15 @@ def test_folder_names_are_safe():
 def test_command_refuses_the_flag_for_a_single_method(tmp_path: Path):
     result = CliRunner().invoke(main, ["compare", str(tmp_path), "--method", "ratio"])
     assert result.exit_code == 2 and "--methods" in result.output
+
+
+@pytest.mark.parametrize(
+    ("method", "shown"),
+    [
+        ("ratio", "ratio"),
+        ("clnet@pose:/work/runs/clnet/latest.pt", "clnet@pose:clnet/latest.pt"),
+        ("corradaptor:mine.pt", "corradaptor:mine.pt"),
+    ],
+)
+def test_methods_are_shown_without_the_folders_of_their_checkpoints(method: str, shown: str) -> None:
+    assert _short(method) == shown
