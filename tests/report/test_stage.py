@@ -16,6 +16,7 @@ from corrsfm.errors import WorkspaceError
 from corrsfm.evaluation.scenes.score import find_model
 from corrsfm.report import MissingReason
 from corrsfm.workspace import StageRecord, Workspace
+from corrsfm.workspace.lists import read_index
 
 RUN = cfg.RunConfig(threads=1, device="cpu")
 
@@ -38,7 +39,11 @@ def workspace(tmp_path: Path) -> Workspace:
     prune(workspace, 0.8)
     (workspace.sparse / "0").mkdir(parents=True)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3, num_points3D=20)
-    pycolmap.synthesize_dataset(options).write_binary(str(workspace.sparse / "0"))
+    model = pycolmap.synthesize_dataset(options)
+    names = read_index(workspace).names
+    for image, name in zip(model.images.values(), names, strict=True):
+        image.name = name
+    model.write_binary(str(workspace.sparse / "0"))
     verified = workspace.require("verified matches").fingerprint
     config = cfg.to_dict(cfg.ReconstructionConfig(min_model_size=2))
     workspace.finish(
