@@ -206,7 +206,9 @@ class ItemStore(Generic[K, T]):
         """What `clear` was given when the file was begun; None if nothing, or if there is no file."""
         if not self.path.exists():
             return None
-        with self._reading(sealed=False) as connection, self._errors():
+        # It is in the file since that was begun, so the log of a process that writes now need not be read.
+        uri = f"{self.path.absolute().as_uri()}?mode=ro&immutable=1"
+        with self._errors(), contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
             return self._about(connection).get("origin")
 
     def seconds(self) -> float:

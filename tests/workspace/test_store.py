@@ -454,3 +454,14 @@ def test_a_folder_in_its_place_is_put_aside(store: ItemStore) -> None:
     store.close()
     assert store.path.is_file()
     assert (store.path.with_name(f"{store.path.name}.damaged") / "notes.txt").read_text() == "not ours"
+
+
+def test_the_origin_can_be_asked_for_while_another_process_writes(store: ItemStore) -> None:
+    store.clear("from elsewhere")
+    store.add("a", "1", make_features())
+    assert store.path.with_name("features.db-wal").exists()
+    assert ItemStore(store.path, FEATURES).origin() == "from elsewhere"
+    store.commit({"a": "1"}, "sealed")
+    assert ItemStore(store.path, FEATURES).origin() == "from elsewhere"
+    store.clear()
+    assert store.origin() is None and not store.finished({"a": "1"})
