@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from corrsfm.disk import explain
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.files import atomic_path, read_json, sha256_of
 from corrsfm.finished.incoming import Incoming
@@ -134,8 +135,8 @@ def copy_photos(incoming: Sequence[Incoming], folder: Path) -> None:
                 shutil.copy2(photo.file, temporary)
         except OSError as error:
             raise InputError(
-                f"{folder / photo.name}: cannot be written ({error.strerror}); put the new photos into the "
-                f"folder of the scene's photos yourself and run the same command on them there"
+                f"{explain(error, folder / photo.name)}; or put the new photos there yourself, and run the same "
+                "command on them there"
             ) from error
     if outside:
         logger.info("copied to %s: %s", folder, first_few(photo.name for photo in outside))
