@@ -135,8 +135,8 @@ def copy_photos(incoming: Sequence[Incoming], folder: Path) -> None:
                 shutil.copy2(photo.file, temporary)
         except OSError as error:
             raise InputError(
-                f"{explain(error, folder / photo.name)}; or put the new photos there yourself, and run the same "
-                "command on them there"
+                f"{explain(error, folder / photo.name)}; or put the new photos there yourself, and run the "
+                "same command on them there"
             ) from error
     if outside:
         logger.info("copied to %s: %s", folder, first_few(photo.name for photo in outside))
