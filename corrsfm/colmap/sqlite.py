@@ -27,6 +27,7 @@ __all__ = [
     "open_for_reading",
     "id_of_pair",
     "rows_digest",
+    "uri_for_reading",
 ]
 
 
@@ -190,14 +191,23 @@ def open_for_reading(path: Path) -> Iterator[sqlite3.Connection]:
     """
     if not path.exists():
         raise DatabaseError(f"{path}: no such database; try: corrsfm prune WORKSPACE")
-    # A log beside it holds what another program, or one that was killed, has written last.
-    in_use = any(path.with_name(path.name + suffix).exists() for suffix in ("-wal", "-journal"))
-    uri = f"{path.absolute().as_uri()}?{'mode=ro' if in_use else 'immutable=1'}"
     with (
         database_errors(path),
-        contextlib.closing(sqlite3.connect(uri, uri=True, timeout=_PATIENCE_S)) as connection,
+        contextlib.closing(
+            sqlite3.connect(uri_for_reading(path), uri=True, timeout=_PATIENCE_S)
+        ) as connection,
     ):
         yield connection
+
+
+def uri_for_reading(path: Path) -> str:
+    """Under which SQLite reads a database and leaves nothing beside it, unless a log is there already.
+
+    The log holds what another program, or one that was killed, has written last. As URI, because a name may
+    hold a question mark or a hash.
+    """
+    in_use = any(path.with_name(path.name + suffix).exists() for suffix in ("-wal", "-journal"))
+    return f"{path.absolute().as_uri()}?{'mode=ro' if in_use else 'immutable=1'}"
 
 
 def find_damage(path: Path) -> str:

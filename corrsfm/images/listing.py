@@ -209,8 +209,8 @@ def find_masks(mask_dir: Path | None, folder: Path, names: Sequence[str]) -> lis
         return [None] * len(names)
     if not mask_dir.is_dir():
         raise InputError(f"{mask_dir}: no such folder; expected the folder with the masks")
-    masks = [f"{name}.png" if (mask_dir / f"{name}.png").is_file() else None for name in names]
     places = [mask_dir / f"{name}.png" for name in names]
+    masks = [f"{name}.png" if place.is_file() else None for name, place in zip(names, places, strict=True)]
     if broken := [path.name for path in places if path.is_symlink() and not path.exists()]:
         raise InputError(f"{mask_dir}: links that lead nowhere: {first_few(broken)}; mend or remove them")
     rule = f"the mask of '{names[0]}' must be '{names[0]}.png'"

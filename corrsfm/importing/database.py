@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.colmap.sqlite import PAIR_BASE, is_sqlite, is_truncated
+from corrsfm.colmap.sqlite import PAIR_BASE, is_sqlite, is_truncated, uri_for_reading
 from corrsfm.errors import InputError
 from corrsfm.importing.checks import features_from, matches_from
 from corrsfm.types import Features, Matches, Pair
@@ -36,11 +36,7 @@ def open_database(path: Path, *, with_matches: bool) -> Iterator[DatabaseSource]
     if is_truncated(path):
         raise InputError(f"{path}: damaged, its end is missing; copy or make it again")
     try:
-        # As URI, because a name may hold a question mark or a hash.
-        # Without a log beside it nobody writes, and reading it as unchangeable leaves no log there either.
-        in_use = any(path.with_name(path.name + suffix).exists() for suffix in ("-wal", "-journal"))
-        uri = f"{path.absolute().as_uri()}?{'mode=ro' if in_use else 'immutable=1'}"
-        with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
+        with contextlib.closing(sqlite3.connect(uri_for_reading(path), uri=True)) as connection:
             yield DatabaseSource(path, connection, with_matches=with_matches)
     except sqlite3.Error as error:
         raise InputError(

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ import bad_options  # noqa: E402
 import bad_paths  # noqa: E402
 import bad_photos  # noqa: E402
 from case import Case, Trial, find_faults  # noqa: E402
-from damages import all_damages, lay_out, try_damage  # noqa: E402
+from damages import Damage, all_damages, lay_out, try_damage  # noqa: E402
 from full_disks import WRITERS, all_full_disks, try_full_disk, why_no_mounts  # noqa: E402
 from kills import (  # noqa: E402
     COMMANDS,
@@ -50,7 +50,7 @@ from permissions import DOINGS, all_closed, try_closed, why_no_users  # noqa: E4
 from place import Place, make_base  # noqa: E402
 from power_cuts import record_cuts  # noqa: E402
 from sandbox import contents, fork, in_child, preload, run_command  # noqa: E402
-from surroundings import all_surroundings, try_surrounding  # noqa: E402
+from surroundings import Surrounding, all_surroundings, try_surrounding  # noqa: E402
 
 Row = dict[str, Any]
 
@@ -112,9 +112,16 @@ class Trials:
         """Try bad inputs."""
         cases = self._drawn([case for case in all_cases() if self._only in case.name], most)
 
+        return self._each(cases, self._try_case)
+
+    def _each(self, found: Sequence[Any], attempt: Callable[[Any, Path], Row]) -> list[Row]:
+        """Rows of attempts, each in a folder of its own that goes afterwards."""
+
         def work(job: int) -> Iterator[Row]:
-            for number, case in enumerate(cases[job :: self._jobs]):
-                yield self._try_case(case, self._root / f"input-{job}-{number}")
+            for number, one in enumerate(found[job :: self._jobs]):
+                folder = self._root / f"attempt-{job}-{number}"
+                yield attempt(one, folder)
+                _remove(folder)
 
         return _side_by_side(work, self._root, self._jobs)
 
@@ -126,7 +133,6 @@ class Trials:
         before = contents(work)
         outcome = run_command(trial.arguments, folder, as_nobody=trial.as_nobody)
         faults = find_faults(trial, outcome, before, contents(work), contents(folder / "tmp"))
-        _remove(folder)
         return {
             "case": case.name,
             "faults": faults,
@@ -146,15 +152,11 @@ class Trials:
             for scene in {damage.scene for damage in found}
         }
 
-        def work(job: int) -> Iterator[Row]:
-            for number, damage in enumerate(found[job :: self._jobs]):
-                folder = self._root / f"damage-{job}-{number}"
-                rng = random.Random(f"{self._seed} {damage.name}")
-                whole = expected[damage.scene]
-                yield in_child(lambda d=damage, f=folder, w=whole, r=rng: try_damage(d, self.base, f, w, r))
-                _remove(folder)
+        def attempt(damage: Damage, folder: Path) -> Row:
+            rng = random.Random(f"{self._seed} {damage.name}")
+            return in_child(lambda: try_damage(damage, self.base, folder, expected[damage.scene], rng))
 
-        return _side_by_side(work, self._root, self._jobs)
+        return self._each(found, attempt)
 
     def kills(self, most: int | None) -> list[Row]:
         """Kill commands so many times, half of them `corrsfm run`; a row for each that is through."""
@@ -203,14 +205,12 @@ class Trials:
         found = self._drawn([one for one in all_surroundings() if self._only in one.name], most)
         expected, _ = in_child(lambda: undisturbed("run", self.base, self._root / "in peace"))
 
-        def work(job: int) -> Iterator[Row]:
-            for number, one in enumerate(found[job :: self._jobs]):
-                folder = self._root / f"surrounding-{job}-{number}"
-                rng = random.Random(f"{self._seed} {one.name}")
-                yield try_surrounding(one, self.base, folder, expected, rng)
-                _remove(folder)
+        def attempt(one: Surrounding, folder: Path) -> Row:
+            return try_surrounding(
+                one, self.base, folder, expected, random.Random(f"{self._seed} {one.name}")
+            )
 
-        return _side_by_side(work, self._root, self._jobs)
+        return self._each(found, attempt)
 
     def disks(self, most: int | None) -> list[Row]:
         """Let the disk run full under commands, and run them again with space."""
@@ -225,14 +225,12 @@ class Trials:
             for name in dict.fromkeys(disk.command for disk in found)
         }
 
-        def work(job: int) -> Iterator[Row]:
-            for number, disk in enumerate(found[job :: self._jobs]):
-                folder = self._root / f"disk-{job}-{number}"
-                wanted = expected[disk.command]
-                yield in_child(lambda d=disk, f=folder, w=wanted: try_full_disk(d, self.base, f, w))
-                _remove(folder)
-
-        return _side_by_side(work, self._root, self._jobs)
+        return self._each(
+            found,
+            lambda disk, folder: in_child(
+                lambda: try_full_disk(disk, self.base, folder, expected[disk.command])
+            ),
+        )
 
     def permissions(self, most: int | None) -> list[Row]:
         """Close files and folders to commands of an ordinary user, and follow the advice."""
@@ -249,14 +247,12 @@ class Trials:
             for name in dict.fromkeys(closed.command for closed in found)
         }
 
-        def work(job: int) -> Iterator[Row]:
-            for number, closed in enumerate(found[job :: self._jobs]):
-                folder = self._root / f"closed-{job}-{number}"
-                wanted = expected[closed.command]
-                yield in_child(lambda c=closed, f=folder, w=wanted: try_closed(c, self.base, f, w))
-                _remove(folder)
-
-        return _side_by_side(work, self._root, self._jobs)
+        return self._each(
+            found,
+            lambda closed, folder: in_child(
+                lambda: try_closed(closed, self.base, folder, expected[closed.command])
+            ),
+        )
 
 
 def _result_of_whole(base: Path, folder: Path, scene: str) -> dict[str, Any]:
