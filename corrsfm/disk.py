@@ -53,10 +53,14 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
     if error.errno in _TOO_MANY:
         return f"{shown}: {str(error.strerror).lower()}; raise the limit, with: ulimit -n 1024"
     if error.errno == errno.EROFS:
-        return f"{shown}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
+        return _read_only(shown)
     if error.errno in _CLOSED:
         return opening(Path(os.fsdecode(named))) if named else f"{shown}: {error.strerror}"
     return f"{shown}: {error.strerror}"
+
+
+def _read_only(path: Path) -> str:
+    return f"{path}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
 
 
 def is_closed(path: Path | str) -> bool:
@@ -77,9 +81,7 @@ def opening(path: Path) -> str:
         return f"{path}: is not there any more; put it back, or run the command again"
     closed, what, mode = _closed(path)
     if mode == "w" and closed.exists() and os.statvfs(closed).f_flag & os.ST_RDONLY:
-        return (
-            f"{closed}: cannot be written, its disk is read-only; use another folder, or a copy of this one"
-        )
+        return _read_only(closed)
     is_own = not closed.exists() or closed.stat().st_uid == os.geteuid()
     words = ["chmod", *(["-R"] if "X" in mode else []), f"{'u' if is_own else 'a'}+{mode}", str(closed)]
     if not is_own:
