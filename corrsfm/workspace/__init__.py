@@ -3,13 +3,18 @@
 ::
 
     workspace/
-    ├── folder.py     paths, which stages are finished
+    ├── folder.py     the folder: begun, held, read, converted
+    ├── layout.py     where every file lies
+    ├── ledger.py     which stages finished, and what their files held
+    ├── manifest.py   workspace.json
     ├── lease.py      which process holds it
     ├── entries.py    that nothing in it is a link or a pipe
     ├── lists.py      images.txt, images.json, pairs.txt
     ├── items.py      features and matches as they are stored
-    ├── store.py      items in an SQLite file, each safe at once
-    ├── rows.py       the tables of such a file, and their checksums
+    ├── rows.py       the tables of their SQLite files, and checksums
+    ├── reader.py     reading such a file, and what its errors mean
+    ├── store.py      writing it, each item safe at once
+    ├── mending.py    what can be saved of a damaged one
     ├── stores.py     the stores of a workspace
     ├── conversion.py those of earlier versions, in HDF5
     ├── hloc.py       hloc's keys and its half pixel
