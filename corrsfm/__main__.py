@@ -7,6 +7,8 @@ __all__ = ["main"]
 
 # With less, numpy's library ends the process while it is loaded, with words of its own.
 LEAST_ADDRESS_BYTES = 192 << 20
+# With fewer, Python itself stumbles before an error can be told.
+LEAST_OPEN_FILES = 32
 _INTERRUPTED = 130
 
 
@@ -27,6 +29,9 @@ def _run() -> None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     if limit != resource.RLIM_INFINITY and limit < LEAST_ADDRESS_BYTES:
         sys.exit("Error: not enough memory to begin; raise the limit with: ulimit -v unlimited")
+    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if limit != resource.RLIM_INFINITY and limit < LEAST_OPEN_FILES:
+        sys.exit(f"Error: only {limit} files may be open at once; raise the limit with: ulimit -n 1024")
     try:
         from corrsfm.cli import main as commands
 

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from corrsfm.cluster import Cluster
 from corrsfm.config import load_pipeline
-from corrsfm.errors import ClusterError, CorrsfmError, InputError, WorkspaceError
+from corrsfm.errors import ClusterError, CorrsfmError, InputError, WorkspaceError, printable
 from corrsfm.files import read_json
 from corrsfm.images.listing import holds_pictures
 from corrsfm.machine import count_threads
@@ -80,14 +80,16 @@ class SceneStatus:
         if self.succeeded and "num_images" in self.statistics:
             num, num_all = (f"{self.statistics[key]:g}" for key in ("num_registered", "num_images"))
             outcome = ", ".join(filter(None, [f"{num} of {num_all} photos", self.verdict]))
-        # A name on disk need not be text.
-        scene = self.scene.encode("utf-8", "replace").decode().replace("\n", "?")
+        # A name on disk need not be text, nor one line.
+        scene = printable(self.scene).replace("\n", "\\n").replace("\t", "\\t")
         text = f"{scene:<24} {result} {self.seconds:8.1f} s  {outcome}"
         return text.rstrip().replace("\n", "\n    ")
 
 
 def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str, Path]:
     """Scenes of a collection: the sub-folders, or their folder `images` where they have one.
+
+    Folders of workspaces, such as the output of another batch, are none.
 
     Parameters
     ----------
@@ -114,7 +116,9 @@ def find_scenes(collection: Path, *, leave_out: Path | None = None) -> dict[str,
     scenes = {
         folder.name: _photos_of(folder)
         for folder in folders
-        if not folder.name.startswith(".") and not (leave_out is not None and _are_same(folder, leave_out))
+        if not folder.name.startswith(".")
+        and not (leave_out is not None and _are_same(folder, leave_out))
+        and not _holds_workspaces(folder)
     }
     if not scenes:
         raise InputError(
@@ -134,6 +138,17 @@ def _is_folder(path: Path) -> bool:
 def _are_same(folder: Path, other: Path) -> bool:
     try:
         return os.path.samefile(folder, other)
+    except OSError:
+        return False
+
+
+def _holds_workspaces(folder: Path) -> bool:
+    """Whether there is nothing in a folder but workspaces and files of a batch."""
+    try:
+        inside = [path for path in folder.iterdir() if not path.name.startswith(".")]
+        # A batch leaves a log beside each workspace.
+        others = [path for path in inside if not path.name.endswith(LOG_NAME)]
+        return bool(others) and all((path / "workspace.json").is_file() for path in others)
     except OSError:
         return False
 

@@ -15,7 +15,7 @@ from click.testing import CliRunner
 from photos import write_photos
 
 from corrsfm import batch
-from corrsfm.batch import find_scenes, run_collection, run_one
+from corrsfm.batch import SceneStatus, find_scenes, run_collection, run_one
 from corrsfm.cli import main
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.report import make_report
@@ -265,6 +265,22 @@ def test_workspaces_inside_the_collection_are_no_scene(tmp_path: Path) -> None:
     root = collection(tmp_path, "a", "out")
     assert list(find_scenes(root)) == ["a", "out"]
     assert list(find_scenes(root, leave_out=root / "a" / ".." / "out")) == ["a"]
+
+
+def test_the_output_of_another_batch_is_no_scene(tmp_path: Path) -> None:
+    root = collection(tmp_path, "a", "b")
+    workspace = root / "b" / "corrsfm"
+    for folder in (root / "out" / "a", workspace):
+        folder.mkdir(parents=True)
+        (folder / "workspace.json").touch()
+    (root / "out" / "a.batch.log").touch()
+    # The photos of a scene may have the workspace beside them.
+    assert list(find_scenes(root)) == ["a", "b"]
+
+
+def test_a_scene_is_one_line_whatever_its_name() -> None:
+    status = SceneStatus(scene="a\nb\x85\r", succeeded=True, seconds=1.0)
+    assert str(status).splitlines() == [str(status)]
 
 
 def stand_ins(root: Path, *names: str) -> dict[str, str]:

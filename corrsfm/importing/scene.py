@@ -272,7 +272,10 @@ def _survey(
         )
     ((size, dtype),) = layouts
     if not size and not source.pairs:
-        raise InputError(f"{source.label}: has neither descriptors nor matches; nothing can be matched")
+        raise InputError(
+            f"{source.label}: no descriptors and no matches to take from there, so nothing can be matched; "
+            "give matches too, or import those there are, without --rematch"
+        )
     return wanted, counts, size, has_shapes, dtype == str(np.dtype(np.uint8))
 
 

@@ -27,6 +27,9 @@ __all__ = ["Workspace"]
 
 logger = logging.getLogger("corrsfm")
 
+# SQLite opens no file whose path is longer than about 500 bytes; names of files inside take up to 100.
+LONGEST_PATH_BYTES = 400
+
 
 class Workspace(Ledger):
     """The folder of one scene.
@@ -43,7 +46,7 @@ class Workspace(Ledger):
     ------
     WorkspaceError
         If the folder is not a workspace, or one of another version, or its manifest is damaged, or it is the
-        folder of the photos.
+        folder of the photos, or its path is too long.
     """
 
     def __init__(self, root: Path, *, create: bool = False, images_dir: Path | None = None) -> None:
@@ -53,6 +56,11 @@ class Workspace(Ledger):
                 f" {root / 'corrsfm'}"
             )
         super().__init__(root)
+        if len(os.fsencode(os.path.realpath(root))) > LONGEST_PATH_BYTES:
+            raise WorkspaceError(
+                f"{root}: path longer than the {LONGEST_PATH_BYTES} bytes that databases there allow; "
+                "choose a folder with a shorter one"
+            )
         # What was there before this workspace was begun, and which folders were made for it; None if it was
         # begun earlier.
         self._begun: tuple[set[str], list[Path]] | None = None

@@ -32,6 +32,14 @@ def test_work_is_done_whatever_becomes_of_the_log(tmp_path: Path, streams: str) 
     assert (tmp_path / "scene" / "matches.db").exists()
 
 
+def test_too_few_files_are_a_line(tmp_path: Path) -> None:
+    result = shell('ulimit -n 9; exec "$@"', "--version", where=tmp_path)
+    assert result.returncode == 1
+    assert result.stderr == (
+        "Error: only 9 files may be open at once; raise the limit with: ulimit -n 1024\n"
+    )
+
+
 def test_a_result_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     result = shell('"$@" >/dev/full', "--help", where=tmp_path)
     assert result.returncode == 1

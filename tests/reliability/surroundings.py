@@ -77,7 +77,16 @@ class Surrounding:
 
 def all_surroundings() -> list[Surrounding]:
     """Every one, in a fixed order; what is drawn of them is when signals come."""
-    return [*_streams(), *_folders(), *_environments(), *_memory(), *_links(), *_held(), *_signals()]
+    return [
+        *_streams(),
+        *_folders(),
+        *_environments(),
+        *_memory(),
+        *_files(),
+        *_links(),
+        *_held(),
+        *_signals(),
+    ]
 
 
 def _streams() -> list[Surrounding]:
@@ -119,6 +128,17 @@ def _memory() -> list[Surrounding]:
     return [
         Surrounding(name=f"run in {kb} kB", words=RUN, shell=f'ulimit -v {kb}; "$@"', codes=(0, 1))
         for kb in limits
+    ]
+
+
+def _files() -> list[Surrounding]:
+    limits = [5, 9, 20, 32, 40, 50, 64, 100, 256]
+    return [
+        Surrounding(name=f"run with {num} files", words=RUN, shell=f'ulimit -n {num}; "$@"', codes=(0, 1))
+        for num in limits
+    ] + [
+        Surrounding(name=f"run with umask {mask}", words=RUN, shell=f'umask {mask}; "$@"')
+        for mask in ("000", "077")
     ]
 
 

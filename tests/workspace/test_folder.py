@@ -39,6 +39,15 @@ def test_a_stage_is_current_only_with_its_fingerprint_and_its_file(workspace: Wo
     assert not workspace.is_current("features", "f", workspace.features)
 
 
+def test_a_path_too_long_for_databases_is_refused_and_leaves_nothing(tmp_path: Path) -> None:
+    root = tmp_path.joinpath(*["long" * 20] * 5)
+    with pytest.raises(
+        WorkspaceError, match="longer than the 400 bytes .* choose a folder with a shorter one"
+    ):
+        Workspace(root, create=True)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_missing_stage_names_the_command_that_makes_it(workspace: Workspace) -> None:
     with pytest.raises(WorkspaceError, match=f"no matches yet; run: corrsfm match {workspace.root}"):
         workspace.require("matches")
