@@ -20,7 +20,7 @@ _OF_THE_DISK = (*_FULL, *_TOO_MANY, errno.EFBIG, errno.EROFS, errno.EIO)
 # Some file systems cannot set space aside.
 _UNKNOWN = (errno.EINVAL, errno.EOPNOTSUPP, errno.ENOSYS)
 _LAST_BYTES = 1 << 12
-_UNFINISHED = re.compile(r"\.(.+)\.partial")
+_UNFINISHED = re.compile(r"\.(.+)\.corrsfm\.partial")
 
 
 def is_of_the_disk(error: OSError) -> bool:

@@ -90,7 +90,7 @@ def _unfinished(path: Path) -> Path:
     """Where a file or folder is written before it gets its name; nothing is there."""
     if path.name in ("", ".."):
         raise WorkspaceError(f"{path}: is a folder; expected the name of what to write in it")
-    temporary = path.with_name(f".{path.name}.partial")
+    temporary = path.with_name(f".{path.name}.corrsfm.partial")
     try:
         make_folder(path.parent)
         _remove(temporary)
@@ -135,9 +135,14 @@ def _remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def replaced_name(folder: Path) -> Path:
+    """Where a folder is while another takes its place, and stays if a kill comes then."""
+    return folder.with_name(f".{folder.name}.corrsfm.old")
+
+
 def _replace_folder(source: Path, target: Path, before_replacing: Callable[[], None]) -> None:
     """Put a folder in another's place; a kill in between leaves neither, never a mixture."""
-    old = target.with_name(f".{target.name}.old")
+    old = replaced_name(target)
     _remove(old)
     _sync_below(source)
     before_replacing()

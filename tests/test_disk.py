@@ -14,7 +14,7 @@ from corrsfm.disk import explain, is_of_the_disk, opening, require_room, room_fo
 def test_a_full_disk_is_named_by_what_was_to_be_written(tmp_path: Path) -> None:
     error = OSError(errno.ENOSPC, "No space left on device", str(tmp_path / "photo.jpg"))
     assert is_of_the_disk(error)
-    assert explain(error, tmp_path / ".out.partial" / "images").startswith(
+    assert explain(error, tmp_path / ".out.corrsfm.partial" / "images").startswith(
         f"{tmp_path / 'out'}: cannot be written, the disk is full"
     )
 

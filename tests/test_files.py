@@ -28,8 +28,8 @@ def test_an_exception_while_writing_leaves_the_old_file(tmp_path: Path) -> None:
 
 
 def test_a_leftover_of_a_killed_writer_is_no_obstacle(tmp_path: Path) -> None:
-    (tmp_path / ".models.partial").mkdir()
-    (tmp_path / ".models.partial" / "junk").write_text("x")
+    (tmp_path / ".models.corrsfm.partial").mkdir()
+    (tmp_path / ".models.corrsfm.partial" / "junk").write_text("x")
     with atomic_path(tmp_path / "models") as temporary:
         temporary.mkdir()
         (temporary / "new").write_text("y")
@@ -109,7 +109,12 @@ def test_a_file_is_on_the_disk_before_its_name_and_its_name_before_it_counts(
 ) -> None:
     flushes = Flushes(monkeypatch)
     atomic_write_text(tmp_path / "new" / "a.txt", "x")
-    assert flushes.seen == [f"flush {tmp_path.name}", "flush .a.txt.partial", "rename a.txt", "flush new"]
+    assert flushes.seen == [
+        f"flush {tmp_path.name}",
+        "flush .a.txt.corrsfm.partial",
+        "rename a.txt",
+        "flush new",
+    ]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="asks /proc what a handle leads to")
@@ -121,7 +126,8 @@ def test_everything_in_a_folder_is_on_the_disk_before_its_name(
         (temporary / "0").mkdir(parents=True)
         (temporary / "0" / "cameras.bin").write_bytes(b"x")
     assert flushes.seen == [
-        "flush .models.partial", "flush cameras.bin", "flush 0", "rename models", f"flush {tmp_path.name}",
+        "flush .models.corrsfm.partial", "flush cameras.bin", "flush 0", "rename models",
+        f"flush {tmp_path.name}",
     ]  # fmt: skip
 
 

@@ -223,10 +223,10 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
             models.append(_read(path))
         except _UNREADABLE as error:
             raise WorkspaceError(
-                f"{path}: is not a readable COLMAP model; try: corrsfm reconstruct --overwrite"
+                f"{path}: no readable COLMAP model; try: corrsfm reconstruct {folder.parent} --overwrite"
             ) from error
     if not models:
-        raise WorkspaceError(f"{folder}: holds no model; try: corrsfm reconstruct")
+        raise WorkspaceError(f"{folder}: holds no model; try: corrsfm reconstruct {folder.parent}")
     return models
 
 

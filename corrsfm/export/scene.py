@@ -29,7 +29,7 @@ from corrsfm.geometry import Pose
 from corrsfm.images.photos import read_photo_info
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
-from corrsfm.workspace.models import models_of
+from corrsfm.workspace.models import are_changed, models_of
 
 __all__ = ["ExportResult", "export_scene"]
 
@@ -262,6 +262,8 @@ def _check_output(path: Path, workspace: Workspace, photos: Path, *, is_file: bo
 
 def _verdict_of(workspace: Workspace) -> str | None:
     """The grade of the model; logged with reasons and a next step unless it is good."""
+    if are_changed(workspace):
+        return None
     try:
         verdict = read_json(workspace.evidence)["verdict"]
         grade, reasons, steps = verdict["grade"], verdict["reasons"], verdict["next_steps"]

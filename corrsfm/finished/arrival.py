@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -57,6 +58,8 @@ def pending_addition(workspace: Workspace) -> Pending:
     """
     try:
         pending = Pending(**read_json(workspace.adding))
+        if not _is_table(pending.photos, str) or not _is_table(pending.options, dict):
+            raise TypeError("its photos or options are no tables")
     except FileNotFoundError:
         workspace.require("models")
         # Photos are put into what is there, and cannot mend it; mapped again it would not be the same model.
@@ -69,11 +72,17 @@ def pending_addition(workspace: Workspace) -> Pending:
             photos={}, options={stage: workspace.require(stage).config for stage in STAGE_COMMANDS}
         )
     except (OSError, ValueError, TypeError) as error:
+        removal = shlex.join(["rm", str(workspace.adding)])
         raise WorkspaceError(
-            f"{workspace.adding}: damaged ({error}); delete it, and do everything again with corrsfm run"
+            f"{workspace.adding}: damaged ({error}); remove it, with: {removal}; then run the command that "
+            "made the scene again"
         ) from error
     logger.info("going on with the addition of %s", first_few(pending.photos))
     return pending
+
+
+def _is_table(values: Any, kind: type) -> bool:
+    return isinstance(values, dict) and all(isinstance(value, kind) for value in values.values())
 
 
 def sort_out(

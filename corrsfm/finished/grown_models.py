@@ -16,7 +16,7 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.pairs import read_verified_matches
-from corrsfm.files import atomic_path, atomic_write_json, read_json
+from corrsfm.files import atomic_path, atomic_write_json, read_json, replaced_name
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
 from corrsfm.reconstruction.calibration import adjustment_options, restore_priors
@@ -163,7 +163,7 @@ def _judge(workspace: Workspace, model: pycolmap.Reconstruction, seed: int) -> N
 
 def _restore_models(workspace: Workspace) -> None:
     """Put the models back if an interruption came while their folder was replaced."""
-    aside = workspace.sparse.with_name(f".{workspace.sparse.name}.old")
+    aside = replaced_name(workspace.sparse)
     if not workspace.sparse.exists() and aside.is_dir():
         os.replace(aside, workspace.sparse)
 

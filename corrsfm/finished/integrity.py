@@ -86,6 +86,9 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             remedy = command_again(workspace, stage)
             if path.exists():
                 remedy = f"{shlex.join(['rm', '-r', str(path)])}; {remedy}"
+        # Nothing is written through them.
+        if links := [str(one) for one in changed if one.is_symlink()]:
+            remedy = f"{shlex.join(['rm', *links])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return [*found, *_changed_records(workspace)]
 

@@ -34,6 +34,8 @@ _MOST_FRAMES = 300
 # of the frames around. A Gaussian blur of 1.5 px at the measured size leaves less than a tenth.
 _BLURRED_SHARE = 0.2
 _FRAMES_AROUND = 5
+# How lists begin that FFmpeg would follow to other files and addresses.
+_PLAYLISTS = (b"ffconcat", b"#EXTM3U", b"v=0")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +91,9 @@ def _open(path: Path) -> cv2.VideoCapture:
         raise InputError(f"{path}: no such file; expected a video")
     if path.stat().st_size == 0:
         raise InputError(f"{path}: the file is empty; copy the video again")
+    with open(path, "rb") as file:
+        if file.read(len(max(_PLAYLISTS, key=len))).startswith(_PLAYLISTS):
+            raise InputError(f"{path}: is a list of other files, expected a video")
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not capture.isOpened():
         raise InputError(

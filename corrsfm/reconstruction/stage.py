@@ -20,7 +20,7 @@ from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
 from corrsfm.disk import is_closed, opening
 from corrsfm.errors import CorrsfmError, InputError, ReconstructionError, first_few
-from corrsfm.files import atomic_path, atomic_write_json
+from corrsfm.files import atomic_write_json
 from corrsfm.graph import connected_components
 from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
@@ -33,6 +33,7 @@ from corrsfm.reconstruction.record import record_of
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import Index, read_added, read_index
+from corrsfm.workspace.models import copy_aside, others_in_models
 from corrsfm.workspace.resume import StageOutcome, explain, finish, require_database
 from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
@@ -70,7 +71,7 @@ def reconstruct(
             logger.info("models: photos added to them without mapping again are kept: %d", len(added))
         return StageOutcome(stage="models", num_items=num, num_reused=num, skipped=True)
     explain(workspace, "models", config)
-    _keep_grown_models(workspace)
+    _keep_models(workspace)
     names = index.names
     if images_dir is None:
         fingerprint = black
@@ -148,8 +149,8 @@ def _replace_evidence(workspace: Workspace, record: dict[str, Any] | None) -> No
         atomic_write_json(workspace.evidence, record, before_replacing=lambda: workspace.forget("models"))
 
 
-def _keep_grown_models(workspace: Workspace) -> None:
-    """Before all is mapped again: say what that means for photos that were added, and keep a copy."""
+def _keep_models(workspace: Workspace) -> None:
+    """Before all is mapped again: keep a copy of what that cannot make again, and say so."""
     if workspace.adding.exists():
         logger.warning(
             "an addition of photos was not finished; all photos are mapped again instead, and every pose "
@@ -157,13 +158,14 @@ def _keep_grown_models(workspace: Workspace) -> None:
             shlex.quote(str(workspace.root)),
         )
     added = read_added(workspace)
+    others = others_in_models(workspace)
+    kept = "there are no models to keep"
+    if workspace.sparse.is_dir() and (added or others):
+        kept = f"the models so far are kept in {copy_aside(workspace)}"
+    if others and not added:
+        logger.warning("not as corrsfm wrote it: %s; %s", first_few(map(str, others)), kept)
     if not added:
         return
-    kept = "there are no models to keep"
-    if workspace.sparse.is_dir():
-        with atomic_path(workspace.root / "sparse.old") as copy:
-            shutil.copytree(workspace.sparse, copy)
-        kept = f"the models so far are kept in {workspace.root / 'sparse.old'}"
     logger.warning(
         "photos added to the models without moving the others: %d (%s); all photos are mapped again "
         "now and every pose moves; %s",

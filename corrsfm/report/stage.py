@@ -80,6 +80,7 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
                 "%s: not as it was written; corrsfm check %s says how it is made again", path, workspace.root
             )
     models = models_of(workspace, changed) if "models" in records else []
+    is_judged = "models" in records and not any(path.is_relative_to(workspace.sparse) for path in changed)
     names = read_index(workspace).names
     summary = make_report(
         scene=workspace.root.resolve().name,
@@ -91,7 +92,7 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
         stage_seconds={stage: record.seconds for stage, record in records.items()},
         configuration={stage: record.config for stage, record in records.items()},
         versions=versions(),
-        evidence=_read_record(workspace.evidence, changed) if "models" in records else {},
+        evidence=_read_record(workspace.evidence, changed) if is_judged else {},
         camera_remarks=_read_record(workspace.cameras_json, changed).get("remarks", []),
         added=[name for name, found in read_added(workspace).items() if found["model"] is not None],
     )

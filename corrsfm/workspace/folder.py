@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import itertools
 import logging
 import os
 import shlex
 import shutil
 from collections.abc import Iterator
+from io import FileIO
 from pathlib import Path
 
 from corrsfm import config as cfg
-from corrsfm.errors import ConfigError, InputError, WorkspaceError
+from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
 from corrsfm.files import OWN_RECORD
 from corrsfm.workspace.entries import check_entries
 from corrsfm.workspace.lease import hold, holder_of
@@ -82,13 +84,14 @@ class Workspace(Ledger):
             )
         if self.root.exists() and not self.root.is_dir():
             raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")
-        # Only corrsfm writes these files: the folder is a workspace that lost its manifest.
-        own = self.photo_cache.exists() or self.images_json.exists()
-        foreign = [path.name for path in (self.database, self.sparse) if path.exists()]
+        own = has_lost_manifest(self.root)
+        # Pictures that are there already are told from our own by a record of theirs.
+        names = [name for name in self._own_names if name != self.frames.name]
+        foreign = [name for name in names if os.path.lexists(self.root / name)]
         if foreign and not own:
             raise WorkspaceError(
-                f"{self.root}: holds {' and '.join(foreign)} of another tool; choose an empty folder, "
-                "nothing was touched"
+                f"{self.root}: holds {first_few(foreign)} of another tool, which a workspace would replace; "
+                f"choose an empty folder, such as {self.root / 'corrsfm'}; nothing was touched"
             )
         if not own:
             before = set(os.listdir(self.root)) if self.root.exists() else set()
@@ -182,7 +185,9 @@ class Workspace(Ledger):
         self.modernise()
         with contextlib.ExitStack() as stack:
             with contextlib.suppress(OSError):
-                handle = stack.enter_context(open(self.root / ".lock", "rb", buffering=0))
+                # A pipe in its place would hold the opening up.
+                flags = os.O_RDONLY | os.O_NONBLOCK
+                handle = stack.enter_context(FileIO(os.open(self.root / ".lock", flags), "r"))
                 try:
                     fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
                 except BlockingIOError as error:
@@ -202,11 +207,16 @@ class Workspace(Ledger):
         places = {path for path in vars(self).values() if isinstance(path, Path) and path.parent == self.root}
         return sorted({path.name for path in places - {self.converted}} | {"pruned"})
 
+    def place_aside(self) -> Path:
+        """Where models go that others replace: the first free one of ``sparse.old``, ``sparse.old.2``, …"""
+        names = ("sparse.old" if number == 1 else f"sparse.old.{number}" for number in itertools.count(1))
+        return next(path for name in names if not os.path.lexists(path := self.root / name))
+
     def put_models_aside(self) -> None:
         """Remember that mapping failed, and move the models of earlier matches out of the way.
 
-        They go to ``sparse.old``, with the reports about them, so that they are not mistaken for new ones,
-        and replace what was moved there before. An addition to them can no longer be finished.
+        They go to `place_aside`, with the reports about them, so that they are not mistaken for new ones. An
+        addition to them can no longer be finished.
         """
         self.forget("models")
         self._values.pop("written", None)
@@ -220,8 +230,6 @@ class Workspace(Ledger):
         for path in (self.run_json, self.evidence, self.added, self.report_json, self.report_html):
             if path.exists():
                 os.replace(path, self.sparse / path.name)
-        aside = self.sparse.with_name("sparse.old")
-        if aside.exists():
-            shutil.rmtree(aside)
+        aside = self.place_aside()
         os.replace(self.sparse, aside)
         logger.warning("the models of the earlier matches were moved to %s", aside)

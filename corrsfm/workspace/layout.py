@@ -20,7 +20,7 @@
     ├── evidence.json       why the first model was chosen, and the verdict on it
     ├── added.json          photos that `corrsfm add` put into finished models, and what became of each
     ├── adding.json         those of an addition that has not finished
-    ├── sparse.old/         models of earlier matches, moved here when mapping failed
+    ├── sparse.old/         models that could not be made again when others replaced them; then sparse.old.2
     ├── warnings.json       what each stage warned of
     ├── report.json, report.html
     ├── .seeds/SEED/        workspaces of further seeds, for `corrsfm compare` and `corrsfm evaluate scene`

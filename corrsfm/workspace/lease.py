@@ -15,8 +15,10 @@ import fcntl
 import json
 import logging
 import os
+import shlex
 import signal
 import socket
+import stat
 import tempfile
 import threading
 import time
@@ -168,15 +170,25 @@ def _judge(file: FileIO, path: Path, me: _Holder, is_locked: bool | None) -> tup
         if is_locked is None:
             is_held = holder not in (None, me) and _is_alive(holder.process)
         return (_State.HELD if is_held else _State.FREE), holder
-    if _now(path.parent) - os.fstat(file.fileno()).st_mtime > LEASE_SECONDS:
+    # Nobody who holds it now has renewed it in the future: a clock was set back, or the file copied.
+    if abs(_now(path.parent) - os.fstat(file.fileno()).st_mtime) > LEASE_SECONDS:
         return (_State.EXPIRED if is_locked is False else _State.FREE), holder
     return (_State.UNSURE if is_locked else _State.HELD), holder
 
 
 def _open(path: Path) -> FileIO:
     try:
-        # A link in its place could lead to any file.
-        return FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+")
+        # A link in its place could lead to any file, and a pipe hold up whoever reads it.
+        file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666), "r+")
+        if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            return file
+        file.close()
+        raise IsADirectoryError
+    except IsADirectoryError as error:
+        removal = shlex.join(["rm", "-r", str(path)])
+        raise WorkspaceError(
+            f"{path}: is a folder, pipe or device, expected a file; run: {removal}"
+        ) from error
     except OSError as error:
         if is_of_the_disk(error):
             copy = ", or work on a copy of the folder" if isinstance(error, PermissionError) else ""

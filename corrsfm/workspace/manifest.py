@@ -54,9 +54,18 @@ def has_lost_manifest(folder: Path) -> bool:
     """Whether a folder holds what only corrsfm writes, but no manifest."""
     if (folder / "workspace.json").exists():
         return False
-    return (folder / ".photos.json").exists() or all(
-        (folder / name).exists() for name in ("images.json", "images.txt")
+    return _has_tables(folder / ".photos.json", "photos") or _has_tables(
+        folder / "images.json", "cameras", "images"
     )
+
+
+def _has_tables(path: Path, *names: str) -> bool:
+    """Whether a file is JSON with these lists or tables; other tools have files of these names too."""
+    try:
+        values = read_json(path)
+        return all(isinstance(values[name], list | dict) for name in names)
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
 
 
 def write_manifest(path: Path, values: dict[str, Any]) -> None:
@@ -79,6 +88,8 @@ def read_manifest(path: Path) -> dict[str, Any]:
     """
     try:
         values = read_json(path)
+        if isinstance(values, dict) and values and not {"format_version", "stages"} & values.keys():
+            raise WorkspaceError(f"{path}: is of another tool; choose another folder for the workspace")
         version = values["format_version"]
         if not isinstance(version, int):
             raise ValueError("its format version is no number")

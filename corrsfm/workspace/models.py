@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from corrsfm.colmap.models import read_models
 from corrsfm.errors import WorkspaceError, first_few
+from corrsfm.files import atomic_path, sha256_of
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index
 
@@ -44,6 +46,11 @@ for point in model.points3D.values():
 """
 
 
+def are_changed(workspace: Workspace) -> bool:
+    """Whether the models are not those that corrsfm wrote and judged."""
+    return any(path.is_relative_to(workspace.sparse) for path in workspace.changed_files("models"))
+
+
 def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> list[pycolmap.Reconstruction]:
     """The reconstructed models, the largest first.
 
@@ -70,10 +77,53 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
         if not _can_be_read(folder):
             remedy = workspace.command_for("models", "--overwrite")
             raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")
-        logger.warning("%s: changed since corrsfm wrote it; it is used as it is", folder)
+        logger.warning(
+            "%s: changed since corrsfm wrote it; it is used as it is, without the verdict on the old "
+            "one; for a new one: %s",
+            folder,
+            workspace.command_for("models", "--overwrite"),
+        )
     models = read_models(workspace.sparse)
     _require_known_photos(workspace, models)
     return models
+
+
+def others_in_models(workspace: Workspace) -> list[Path]:
+    """What a user has put among the models, or changed there."""
+    record = workspace.record_of("models")
+    wanted = record.files if record is not None else {}
+    found = [path for path in sorted(workspace.sparse.rglob("*")) if not path.is_dir()]
+    written = {workspace.root / name for name in wanted}
+    # Of models without a record, those of corrsfm are numbered.
+    others = [
+        path
+        for path in found
+        if path not in written and (wanted or not path.relative_to(workspace.sparse).parts[0].isdecimal())
+    ]
+    changed = [path for path in workspace.changed_files("models") if path in found]
+    return sorted({*others, *changed})
+
+
+def copy_aside(workspace: Workspace) -> Path:
+    """Copy the models, before others replace them, to where nothing replaces the copy.
+
+    Returns
+    -------
+    Path
+        Of the copy; the last one if that is the same.
+    """
+    place = workspace.place_aside()
+    copies = sorted(workspace.root.glob("sparse.old*"), key=lambda path: (len(path.name), path.name))
+    # A run that was killed and goes on makes one copy.
+    if copies and _contents(copies[-1]) == _contents(workspace.sparse):
+        return copies[-1]
+    with atomic_path(place) as copy:
+        shutil.copytree(workspace.sparse, copy)
+    return place
+
+
+def _contents(folder: Path) -> dict[Path, str]:
+    return {path.relative_to(folder): sha256_of(path) for path in folder.rglob("*") if path.is_file()}
 
 
 def _require_known_photos(workspace: Workspace, models: Iterable[pycolmap.Reconstruction]) -> None:

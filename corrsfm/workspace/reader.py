@@ -175,7 +175,7 @@ class ItemReader(ABC, Generic[K, T]):
 
     def origin(self) -> str | None:
         """What `clear` was given when the file was begun; None if nothing, or if there is no file."""
-        if not self.path.exists():
+        if not self.path.is_file():
             return None
         # It is in the file since that was begun, so the log of a process that writes now need not be read.
         uri = f"{self.path.absolute().as_uri()}?mode=ro&immutable=1"

@@ -242,9 +242,18 @@ def test_an_interruption_while_models_are_replaced_loses_none(
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(grown_models, "grow", interrupt)
         add_photos(scene.workspace, scene.new, run=RUN)
-    (scene.workspace / "sparse").rename(scene.workspace / ".sparse.old")
+    (scene.workspace / "sparse").rename(scene.workspace / ".sparse.corrsfm.old")
     result = add_photos(scene.workspace, run=RUN)
     assert [photo.model for photo in result.photos] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    "content", ["[]", '{"photos": 5, "options": {}}', '{"photos": {"a": 1}, "options": {}}']
+)
+def test_a_damaged_note_of_an_addition_is_named(scene: SceneToGrow, content: str) -> None:
+    (scene.workspace / "adding.json").write_text(content)
+    with pytest.raises(WorkspaceError, match=r"adding\.json: damaged .* remove it, with: rm "):
+        add_photos(scene.workspace, run=RUN)
 
 
 def test_photos_in_the_folder_of_the_scene_are_used_where_they_are(scene: SceneToGrow) -> None:

@@ -117,6 +117,13 @@ def test_durations(text: str, seconds: float) -> None:
     assert seconds_of(text) == pytest.approx(seconds)
 
 
+@pytest.mark.parametrize("content", ["ffconcat version 1.0\nfile other.mp4\n", "#EXTM3U\n", "v=0\n"])
+def test_a_list_of_other_files_is_no_video(tmp_path: Path, content: str) -> None:
+    (tmp_path / "video.mp4").write_text(content)
+    with pytest.raises(InputError, match=r"video\.mp4: is a list of other files"):
+        extract_frames(tmp_path / "video.mp4", tmp_path / "frames")
+
+
 @pytest.mark.parametrize("text", ["", "s", "fast", "0", "-1s", "nan", "inf"])
 def test_what_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="expected a time such as 0.5s"):

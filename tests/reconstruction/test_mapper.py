@@ -368,7 +368,7 @@ def test_folder_without_models_is_named(tmp_path: Path) -> None:
     with pytest.raises(WorkspaceError, match="holds no model"):
         read_models(tmp_path)
     (tmp_path / "0").mkdir()
-    with pytest.raises(WorkspaceError, match="not a readable COLMAP model"):
+    with pytest.raises(WorkspaceError, match="no readable COLMAP model"):
         read_models(tmp_path)
 
 

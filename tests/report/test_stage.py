@@ -53,6 +53,17 @@ def workspace(tmp_path: Path) -> Workspace:
     return workspace
 
 
+def test_the_verdict_on_a_model_is_not_that_on_one_in_its_place(workspace: Workspace) -> None:
+    verdict = {"grade": "good", "reasons": ["as it should be"], "next_steps": []}
+    workspace.evidence.write_text(json.dumps({"verdict": verdict}))
+    workspace.finish("models", workspace.require("models"))
+    assert pipeline.report(workspace).evidence["verdict"]["grade"] == "good"
+    model = pycolmap.Reconstruction(workspace.sparse / "0")
+    model.delete_point3D(next(iter(model.points3D)))
+    model.write_binary(str(workspace.sparse / "0"))
+    assert pipeline.report(workspace).evidence == {}
+
+
 def test_current_models_are_reported(workspace: Workspace) -> None:
     summary = pipeline.report(workspace)
     assert [model.num_points for model in summary.models] == [20]

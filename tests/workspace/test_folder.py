@@ -3,6 +3,8 @@
 import errno
 import fcntl
 import json
+import os
+import re
 import shlex
 import subprocess
 import sys
@@ -120,14 +122,30 @@ def test_a_folder_that_is_no_workspace_is_refused(tmp_path: Path) -> None:
         Workspace(tmp_path)
 
 
-def test_a_folder_with_another_tools_database_is_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "database.db").write_bytes(b"precious")
-    with pytest.raises(WorkspaceError, match=r"database\.db of another tool"):
+@pytest.mark.parametrize("name", ["database.db", "images.txt", "images.json", ".photos.json", "log.txt"])
+def test_a_folder_with_files_that_would_be_replaced_is_not_touched(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"{}")
+    with pytest.raises(WorkspaceError, match=f"holds {re.escape(name)} of another tool"):
         Workspace(tmp_path, create=True)
-    assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_bytes() == b"{}"
 
 
-@pytest.mark.parametrize("present", [[], ["0.jpg", "log.txt"]])
+def test_another_tools_manifest_is_not_called_damaged(tmp_path: Path) -> None:
+    (tmp_path / "workspace.json").write_text('{"folders": []}')
+    with pytest.raises(WorkspaceError, match="is of another tool; choose another folder"):
+        Workspace(tmp_path, create=True)
+
+
+def test_a_pipe_in_the_place_of_the_lock_holds_nobody_up(workspace: Workspace) -> None:
+    os.mkfifo(workspace.root / ".lock")
+    with workspace.reading():
+        pass
+    with pytest.raises(WorkspaceError, match=r"expected a file; run: rm -r .*\.lock"), workspace.lock():
+        pass
+
+
+@pytest.mark.parametrize("present", [[], ["0.jpg", "notes.txt"]])
 def test_a_workspace_begun_with_unusable_input_vanishes_and_nothing_else_does(
     tmp_path: Path, present: list[str]
 ) -> None:
@@ -150,7 +168,7 @@ def test_unusable_input_costs_a_workspace_nothing_that_it_holds(workspace: Works
         with pytest.raises(InputError), begun.lock():
             raise InputError("no photos")
         assert begun.manifest.exists()
-    workspace.photo_cache.touch()
+    workspace.photo_cache.write_text('{"photos": {}}')
     workspace.manifest.unlink()
     again = Workspace(workspace.root, create=True)
     with pytest.raises(InputError), again.lock():
@@ -174,8 +192,8 @@ def test_a_link_in_the_place_of_the_lock_is_not_followed(workspace: Workspace, t
 
 
 def test_a_workspace_without_its_manifest_goes_on(workspace: Workspace) -> None:
-    for path in (workspace.images_json, workspace.database):
-        path.touch()
+    workspace.images_json.write_text('{"cameras": [], "images": []}')
+    workspace.database.touch()
     workspace.manifest.write_text("{")
     with pytest.raises(WorkspaceError, match="remove it alone, with: rm -r .*; then run the commands"):
         Workspace(workspace.root, create=True)
@@ -236,9 +254,13 @@ def test_a_failing_lock_is_not_taken_for_another_process(
         pass
 
 
-def test_a_workspace_that_cannot_be_written_is_refused(workspace: Workspace) -> None:
-    # Stands for a file system that is mounted read-only: tests may run as root, who may write anywhere.
-    (workspace.root / ".lock").mkdir()
+def test_a_workspace_that_cannot_be_written_is_refused(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> int:
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(WorkspaceError, match="nothing can be written there.*copy"), workspace.lock():
         pass
 
@@ -263,8 +285,10 @@ def test_models_put_aside_take_their_reports_along(workspace: Workspace) -> None
     assert (aside / "run.json").read_text() == "first"
     make("second")
     workspace.put_models_aside()
-    assert sorted(path.name for path in aside.iterdir()) == ["0", "run.json"]
-    assert (aside / "run.json").read_text() == "second"
+    second = workspace.root / "sparse.old.2"
+    assert sorted(path.name for path in second.iterdir()) == ["0", "run.json"]
+    assert (second / "run.json").read_text() == "second"
+    assert (aside / "run.json").read_text() == "first"
 
 
 def test_the_folder_of_the_photos_is_no_workspace_and_stays_as_it_is(tmp_path: Path) -> None:

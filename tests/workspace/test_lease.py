@@ -105,6 +105,15 @@ def test_a_file_of_an_older_corrsfm_or_of_rubbish_is_free(path: Path) -> None:
             pass
 
 
+def test_a_hold_of_the_future_is_nobodys(path: Path) -> None:
+    """A clock was set back, or the file copied with its time from a machine whose clock is ahead."""
+    path.write_text('{"host": "elsewhere", "process": 1, "token": "x"}')
+    os.utime(path, (time.time() + 7200,) * 2)
+    started = time.monotonic()
+    with hold(path):
+        assert time.monotonic() - started < 20
+
+
 @pytest.mark.usefixtures("short", "no_locks")
 def test_without_locks_in_the_kernel_the_lease_alone_holds(path: Path) -> None:
     other = holder(path)

@@ -7,7 +7,7 @@ from finished_scene import make_finished_scene
 
 from corrsfm.errors import WorkspaceError
 from corrsfm.workspace import StageRecord, Workspace
-from corrsfm.workspace.models import models_of
+from corrsfm.workspace.models import copy_aside, models_of, others_in_models
 
 
 @pytest.fixture
@@ -28,6 +28,27 @@ def test_a_model_that_another_program_adjusted_is_used_with_a_warning(
     (again,) = models_of(workspace)
     assert "changed since corrsfm wrote it" in caplog.text
     assert again.num_points3D() == model.num_points3D()
+
+
+def test_what_others_put_among_the_models_is_told_from_what_corrsfm_wrote(workspace: Workspace) -> None:
+    assert others_in_models(workspace) == []
+    (workspace.sparse / "0_edited").mkdir()
+    (workspace.sparse / "0_edited" / "cameras.txt").touch()
+    (workspace.sparse / "0" / "images.bin").write_bytes(b"edited")
+    others = [workspace.sparse / "0" / "images.bin", workspace.sparse / "0_edited" / "cameras.txt"]
+    assert others_in_models(workspace) == others
+    # After a kill between the record and the models there is no record.
+    workspace.forget("models")
+    assert others_in_models(workspace) == others[1:]
+
+
+def test_models_are_copied_aside_once_and_never_over_another_copy(workspace: Workspace) -> None:
+    first = copy_aside(workspace)
+    assert first == copy_aside(workspace) == workspace.root / "sparse.old"
+    (workspace.sparse / "notes.txt").write_text("mine")
+    second = copy_aside(workspace)
+    assert second == copy_aside(workspace) == workspace.root / "sparse.old.2"
+    assert (second / "notes.txt").exists() and not (first / "notes.txt").exists()
 
 
 @pytest.mark.parametrize("name", ["../../mine.jpg", "/tmp/mine.jpg", "unknown.jpg"])

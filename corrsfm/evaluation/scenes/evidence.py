@@ -12,6 +12,7 @@ from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import Views
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.models import are_changed
 from corrsfm.workspace.stores import features_of
 
 __all__ = ["ModelEvidence", "common_evidence", "evidence_of"]
@@ -46,6 +47,8 @@ def evidence_of(workspace: Workspace, views: Views) -> ModelEvidence:
         Of its largest model.
     """
     try:
+        if are_changed(workspace):
+            raise ValueError("is of models that were changed since")
         record = read_json(workspace.evidence)
         return ModelEvidence(
             explained_share=float(record["explained_share"]),
