@@ -195,6 +195,11 @@ OUTPUTS = {
     "output", "csv_file", "keep", "results",
     *("workspace_dir",),
 }  # fmt: skip
+MINE = (
+    "images.txt", "images.json", "cameras.json", "pairs.txt", "log.txt", "report.html", "database.db", "sparse/0/a",
+    ".photos.json", "evidence.json", "features.db/a", "run.json",
+)  # fmt: skip
+"""What a user may have in a folder, of the names that a workspace has."""
 NEEDED_WITH = {"superpoint_weights": ["--extractor", "superpoint"]}
 
 
@@ -213,6 +218,20 @@ def cases() -> Iterator[Case]:
                         name=f"path {words} {parameter.name} {kind}",
                         prepare=lambda place, w=words, p=parameter, k=kind: _trial(place, w, p, k),
                     )
+    for words in ("run", "extract", "import"):
+        for name in MINE:
+            yield Case(
+                name=f"path {words} over {name} of the user",
+                prepare=lambda place, w=words, n=name: _over(place, w, n),
+            )
+
+
+def _over(place: Place, words: str, name: str) -> Trial:
+    """The folder of the workspace holds a file that the workspace would replace."""
+    arguments, more, _ = good_call(words, place)
+    place.file(f"out/{name}", "mine")
+    given = [word for values in arguments.values() for word in values]
+    return Trial(arguments=[words, *given, *more], named=[name.split("/")[0]], writes=[])
 
 
 def _trial(place: Place, words: str, parameter: click.Parameter, kind: str) -> Trial:

@@ -47,6 +47,9 @@ OTHERS: dict[str, list[str]] = {
 }
 """Commands that read a scene."""
 
+_WAYS_OF_LOCKS = ("a folder", "a pipe", "noise")
+"""A lock is only there while somebody works."""
+
 MOST_ROUNDS = 4
 # Numbers that may be right, with the checksum of them, and what a later version would write: must not be
 # stumbled over, but cannot be noticed or mended.
@@ -90,7 +93,7 @@ def _damages_of(scene: str, folder: Path) -> list[Damage]:
         if path.is_dir():
             ways = _ways_of_folders()
         elif name == ".lock":
-            continue
+            ways = {way: spoil for way, spoil in _ways_of_files(name).items() if way in _WAYS_OF_LOCKS}
         else:
             ways = {**_ways_of_files(name), **_ways_of_json(path), **_ways_of_stores(name)}
         label = name if scene == "plain" else f"{scene} {name}"
