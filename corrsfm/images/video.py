@@ -6,6 +6,7 @@ measure every frame on a small copy, once to keep those that are chosen.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,7 +95,11 @@ def _open(path: Path) -> cv2.VideoCapture:
     with open(path, "rb") as file:
         if file.read(len(max(_PLAYLISTS, key=len))).startswith(_PLAYLISTS):
             raise InputError(f"{path}: is a list of other files, expected a video")
+    # FFmpeg and OpenCV report what is wrong with a video by themselves, line upon line.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():
         raise InputError(
             f"{path}: cannot be opened as a video; it is damaged, cut off (which loses the index of a "

@@ -47,7 +47,7 @@ def why_no_model(graph: PairGraph, cut_off: str = "") -> str:
     if not graph.num_matches:
         return (
             f"{nothing}all {graph.num_recorded} pairs were pruned to nothing; "
-            "try a more lenient prune method such as --method ratio, or photos that overlap more"
+            "try more lenient pruning, such as --method ratio --max-ratio 0.9, or photos that overlap more"
         )
     if not graph.num_inliers:
         return (
