@@ -365,6 +365,11 @@ def _write_features(
         raise InputError(f"{name}: a keypoint is not a finite number; extract its features again")
     keypoints = features.keypoints
     if features.scales is not None and features.orientations is not None:
+        # pycolmap ends the whole process on a scale that is none.
+        if not (np.isfinite(features.scales).all() and (features.scales > 0).all()):
+            raise InputError(
+                f"{name}: the scale of a keypoint is not a finite number above 0; extract its features again"
+            )
         keypoints = np.column_stack([keypoints, features.scales, features.orientations])
     database.write_keypoints(image_id, np.ascontiguousarray(keypoints, np.float32))
     if write_descriptors and features.descriptors.shape[1]:

@@ -97,10 +97,16 @@ def _decode_features(arrays: Mapping[str, NDArray], attributes: Mapping[str, Any
     descriptors = arrays["descriptors"]
     if not np.isfinite(arrays["keypoints"]).all():
         raise ValueError("keypoints that are not finite")
+    scales, orientations = arrays.get("scales"), arrays.get("orientations")
+    # pycolmap ends the whole process on a scale that is none.
+    if scales is not None and not (np.isfinite(scales).all() and (scales > 0).all()):
+        raise ValueError("scales that are not finite and above 0")
+    if orientations is not None and not np.isfinite(orientations).all():
+        raise ValueError("orientations that are not finite")
     return Features(
         keypoints=arrays["keypoints"],
-        scales=arrays.get("scales"),
-        orientations=arrays.get("orientations"),
+        scales=scales,
+        orientations=orientations,
         scores=arrays["scores"],
         descriptors=descriptors if descriptors.dtype == np.uint8 else descriptors.astype(np.float32),
         image_size=(width, height),
