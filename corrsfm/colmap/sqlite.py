@@ -9,7 +9,7 @@ import marshal
 import os
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from corrsfm.disk import explain, opening
@@ -22,10 +22,13 @@ __all__ = [
     "copy_errors",
     "database_errors",
     "find_damage",
+    "find_strange_table",
     "is_sqlite",
     "is_truncated",
     "open_for_reading",
     "id_of_pair",
+    "require_colmap_tables",
+    "require_tables",
     "rows_digest",
     "uri_for_reading",
 ]
@@ -70,6 +73,10 @@ def database_errors(path: Path, shown: Path | None = None) -> Iterator[None]:
     """
     try:
         yield
+    except UnicodeDecodeError as error:
+        raise DatabaseError(
+            f"{shown or path}: damaged, a name there is not UTF-8; delete the file and make it again"
+        ) from error
     except (RuntimeError, sqlite3.Error) as error:
         message = f"SQLite error: {error}" if isinstance(error, sqlite3.Error) else str(error)
         explanation = _explain(path, message)
@@ -197,7 +204,58 @@ def open_for_reading(path: Path) -> Iterator[sqlite3.Connection]:
             sqlite3.connect(uri_for_reading(path), uri=True, timeout=_PATIENCE_S)
         ) as connection,
     ):
+        require_colmap_tables(connection)
         yield connection
+
+
+# COLMAP's, and ours beside them.
+_COLMAP_TABLES = frozenset({
+    "cameras", "corrsfm_about", "corrsfm_pairs", "descriptors", "frame_data", "frames", "images", "keypoints",
+    "matches", "pose_priors", "rig_sensors", "rigs", "two_view_geometries",
+})  # fmt: skip
+
+
+def require_colmap_tables(connection: sqlite3.Connection) -> None:
+    """See `require_tables`, for a database that corrsfm or COLMAP wrote and may write."""
+    require_tables(connection, _COLMAP_TABLES, may_have_triggers=False)
+
+
+def require_tables(
+    connection: sqlite3.Connection, names: Collection[str], *, may_have_triggers: bool = True
+) -> None:
+    """Refuse a file in which a name that is read or written stands for something else than a table.
+
+    A view may never end, and a trigger does more than what is asked. A name that is not there is left to
+    whoever asks for it.
+
+    Parameters
+    ----------
+    connection : sqlite3.Connection
+    names : collection of str
+        In lower case; SQLite's do not depend on it.
+    may_have_triggers : bool
+        Whether the tables are only read.
+
+    Raises
+    ------
+    sqlite3.DatabaseError
+    """
+    if strange := _strange_table(connection, names, may_have_triggers):
+        raise sqlite3.DatabaseError(strange)
+
+
+def _strange_table(connection: sqlite3.Connection, names: Collection[str], may_have_triggers: bool) -> str:
+    """What is no table, or has a trigger; empty if nothing."""
+    query = "SELECT type, name, tbl_name, coalesce(rootpage, 0) FROM sqlite_master WHERE type <> 'index'"
+    for kind, name, table, page in connection.execute(query):
+        if table.lower() not in names:
+            continue
+        if kind == "trigger" and not may_have_triggers:
+            return f"{table} has a trigger"
+        # A virtual table has no page of its own.
+        if kind == "view" or (kind == "table" and page == 0):
+            return f"{name} is a {'virtual table' if kind == 'table' else kind}, expected a table"
+    return ""
 
 
 def uri_for_reading(path: Path) -> str:
@@ -218,6 +276,19 @@ def find_damage(path: Path) -> str:
     except DatabaseError as error:
         return str(error.__cause__ or error)
     return "" if result == "ok" else str(result)
+
+
+def find_strange_table(path: Path) -> str:
+    """What in a database is no table and must be one, empty if nothing; a file that cannot be read has none.
+
+    It costs a look at the schema, where `find_damage` reads everything.
+    """
+    with (
+        contextlib.suppress(sqlite3.Error),
+        contextlib.closing(sqlite3.connect(uri_for_reading(path), uri=True)) as connection,
+    ):
+        return _strange_table(connection, _COLMAP_TABLES, may_have_triggers=False)
+    return ""
 
 
 def rows_digest(path: Path) -> str | None:

@@ -11,7 +11,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Set
 from pathlib import Path
 
-from corrsfm.colmap.sqlite import database_errors, id_of_pair
+from corrsfm.colmap.sqlite import database_errors, id_of_pair, require_colmap_tables
 from corrsfm.types import Pair
 
 __all__ = ["forget_pairs", "image_ids", "recorded_pairs", "remember_pairs"]
@@ -104,4 +104,5 @@ def remember_pairs(path: Path, base: str, fingerprints: Mapping[Pair, str]) -> N
 @contextlib.contextmanager
 def _connection(path: Path) -> Iterator[sqlite3.Connection]:
     with contextlib.closing(sqlite3.connect(path, timeout=5)) as database:
+        require_colmap_tables(database)
         yield database

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from corrsfm import config as cfg
 from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.colmap.log import pycolmap_version
-from corrsfm.colmap.sqlite import find_damage, is_truncated
+from corrsfm.colmap.sqlite import find_damage, find_strange_table, is_truncated
 from corrsfm.config import config_hash
 from corrsfm.database.cameras_by_votes import assign_by_votes, cameras_that_vote
 from corrsfm.database.focal_evidence import PairPoints
@@ -123,7 +123,7 @@ def _damage(path: Path, *, thorough: bool) -> str:
         return ""
     if is_truncated(path):
         return "its end is missing"
-    return find_damage(path) if thorough else ""
+    return find_damage(path) if thorough else find_strange_table(path)
 
 
 def fingerprint_of(workspace: Workspace, config: cfg.DatabaseConfig, seed: int) -> str:

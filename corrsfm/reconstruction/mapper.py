@@ -15,7 +15,7 @@ import pycolmap
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import summarise_model, write_model
-from corrsfm.colmap.sqlite import LOG_BYTES, database_errors
+from corrsfm.colmap.sqlite import LOG_BYTES, database_errors, find_strange_table
 from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.disk import room_for
 from corrsfm.errors import DatabaseError, ReconstructionError
@@ -96,6 +96,8 @@ def reconstruct(
     """
     if not database.is_file():
         raise DatabaseError(f"{database}: no such database; try: corrsfm prune WORKSPACE")
+    if strange := find_strange_table(database):
+        raise DatabaseError(f"{database}: damaged, {strange}; delete the file and make it again")
     with (
         atomic_path(output, before_replacing=before_replacing) as temporary,
         # Where pycolmap cannot make a log beside the database, it leaves half of one.

@@ -9,6 +9,7 @@ import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
+from corrsfm.colmap.sqlite import require_tables
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import atomic_path, share_file
 from corrsfm.workspace.rows import WHOLE_ROWS, Row, insert_row, is_intact, new_file, transaction
@@ -92,6 +93,8 @@ def readable_rows(path: Path) -> Iterator[Row]:
         contextlib.suppress(sqlite3.DatabaseError),
         contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection,
     ):
+        # Of one whose rows are made by a view none are what was written.
+        require_tables(connection, ("items", "arrays"))
         connection.text_factory = lambda raw: raw.decode("utf-8", "replace")
         number = 0
         while (found := _next_number(connection, number)) is not None:

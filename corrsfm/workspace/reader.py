@@ -15,10 +15,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Generic
 
+from corrsfm.colmap.sqlite import require_tables
 from corrsfm.disk import opening
 from corrsfm.errors import DamageError, InputError, WorkspaceError, first_few
 from corrsfm.workspace.items import Arrays, Attributes, K, Kind, T
-from corrsfm.workspace.rows import APPLICATION_ID, FORMAT_VERSION, WHOLE_ROWS, is_intact, unpack
+from corrsfm.workspace.rows import APPLICATION_ID, FORMAT_VERSION, TABLES, WHOLE_ROWS, is_intact, unpack
 
 __all__ = ["ItemReader", "shown_key"]
 
@@ -274,6 +275,7 @@ class ItemReader(ABC, Generic[K, T]):
         # That of the workspace was read before: a file of another corrsfm does not get here.
         if version != FORMAT_VERSION:
             raise sqlite3.DatabaseError(f"format version {version}, expected {FORMAT_VERSION}")
+        require_tables(connection, TABLES, may_have_triggers=False)
         about = {str(name): str(value) for name, value in connection.execute("SELECT name, value FROM about")}
         if about.get("kind") != self.kind.label:
             raise sqlite3.DatabaseError(f"holds {about.get('kind')}, expected {self.kind.label}")

@@ -298,11 +298,13 @@ def require_database(workspace: Workspace) -> StageRecord:
     WorkspaceError
         Naming the command to run.
     """
-    from corrsfm.colmap.sqlite import is_truncated
+    from corrsfm.colmap.sqlite import find_strange_table, is_truncated
 
     record = workspace.require("verified matches")
     path = workspace.database
     if not path.is_file() or is_truncated(path):
         what = "damaged, its end is missing" if path.is_file() else "missing"
         raise WorkspaceError(f"{path}: {what}; run: {workspace.command_for('verified matches')}")
+    if strange := find_strange_table(path):
+        raise WorkspaceError(f"{path}: damaged, {strange}; run: {workspace.command_for('verified matches')}")
     return record

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 __all__ = [
     "APPLICATION_ID",
     "FORMAT_VERSION",
+    "TABLES",
     "WHOLE_ROWS",
     "create_tables",
     "delete_item",
@@ -41,6 +42,7 @@ _SCHEMA = """
     CREATE TABLE arrays (
         number INTEGER PRIMARY KEY, layout TEXT NOT NULL, data BLOB NOT NULL, checksum INTEGER NOT NULL);
 """
+TABLES = frozenset({"about", "items", "arrays"})
 WHOLE_ROWS = (
     "SELECT key, fingerprint, attributes, seconds, items.checksum, layout, data, arrays.checksum"
     " FROM items JOIN arrays USING (number)"

@@ -60,6 +60,17 @@ def lose_an_item(path: Path) -> None:
         store.execute("DELETE FROM items WHERE number = 1")
 
 
+def plant_a_view(path: Path) -> None:
+    table = "matches" if path.name == "database.db" else "items"
+    with contextlib.closing(sqlite3.connect(path)) as store:
+        store.execute(f"ALTER TABLE {table} RENAME TO old")
+        store.execute(
+            f"CREATE VIEW {table} AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n FROM c) "
+            "SELECT n AS pair_id, n AS rows, n AS key FROM c"
+        )
+        store.commit()
+
+
 @pytest.mark.parametrize(
     ("attribute", "damage", "stage"),
     [
@@ -75,6 +86,9 @@ def lose_an_item(path: Path) -> None:
         ("pruned", cut, "pruned matches"),
         ("pruned", change_a_value, "pruned matches"),
         ("database", cut, "verified matches"),
+        ("database", plant_a_view, "verified matches"),
+        ("features", plant_a_view, "features"),
+        ("matches", plant_a_view, "matches"),
         ("sparse", cut_model, "models"),
         ("sparse", shutil.rmtree, "models"),
         ("report_json", cut, "report"),

@@ -465,3 +465,44 @@ def test_the_origin_can_be_asked_for_while_another_process_writes(store: ItemSto
     assert ItemStore(store.path, FEATURES).origin() == "from elsewhere"
     store.clear()
     assert store.origin() is None and not store.finished({"a": "1"})
+
+
+ENDLESS = "CREATE VIEW {} AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n FROM c) SELECT * FROM c"
+
+
+@pytest.mark.parametrize("table", ["about", "items", "arrays"])
+def test_a_view_in_place_of_a_table_is_damage_that_mending_repairs(store: ItemStore, table: str) -> None:
+    with contextlib.closing(sqlite3.connect(fill(store).path)) as connection:
+        connection.execute(f"ALTER TABLE {table} RENAME TO old")
+        connection.execute(ENDLESS.format(table.upper()))
+        connection.commit()
+    for look in (lambda: store.read("a"), store.find_damage, store.origin, store.seal, store.seconds):
+        with pytest.raises(DamageError, match=f"{table.upper()} is a view.*run: corrsfm extract .* --verify"):
+            look()
+    (lost,) = store.mend()
+    assert f"{3 if table == 'about' else 0} whole items are kept" in lost
+    assert store.find_damage() == []
+
+
+def test_a_trigger_is_damage_whose_items_are_kept(store: ItemStore) -> None:
+    with contextlib.closing(sqlite3.connect(fill(store).path)) as connection:
+        connection.execute("CREATE TRIGGER t AFTER INSERT ON items BEGIN DELETE FROM items; END")
+        connection.commit()
+    with pytest.raises(DamageError, match="items has a trigger"):
+        store.add("d", "1", make_features())
+    assert "3 whole items are kept" in store.mend()[0]
+    store.add("d", "1", make_features())
+    assert store.held("abcd").keys() == set("abcd")
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("scales", np.nan), ("scales", -1), ("scales", 0), ("scales", np.inf), ("orientations", np.nan)],
+)
+def test_scales_and_orientations_that_are_none_are_damage(store: ItemStore, name: str, value: float) -> None:
+    features = make_features()
+    getattr(features, name)[2] = value
+    store.add("a", "1", features)
+    with pytest.raises(DamageError, match=f"a: {name} that are not finite"):
+        store.read("a")
+    assert store.find_damage() == ["a"]
