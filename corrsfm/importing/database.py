@@ -6,11 +6,12 @@ import contextlib
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.colmap.sqlite import PAIR_BASE, is_sqlite, is_truncated, uri_for_reading
+from corrsfm.colmap.sqlite import PAIR_BASE, is_sqlite, is_truncated, require_tables, uri_for_reading
 from corrsfm.errors import InputError
 from corrsfm.importing.checks import features_from, matches_from
 from corrsfm.types import Features, Matches, Pair
@@ -19,6 +20,8 @@ __all__ = ["DatabaseSource", "open_database"]
 
 _SIFT_SIZE = 128
 _TABLES = {"images", "keypoints", "descriptors", "matches"}
+_AGAIN = "the database is damaged, copy or make it again"
+_MOST_SHOWN = 20
 
 
 @contextlib.contextmanager
@@ -51,14 +54,8 @@ class DatabaseSource:
     def __init__(self, path: Path, connection: sqlite3.Connection, *, with_matches: bool) -> None:
         self._connection = connection
         self.label = str(path)
-        # A view may never end.
-        views = connection.execute("SELECT name FROM sqlite_master WHERE type = 'view'").fetchall()
-        if strange := sorted({str(name) for (name,) in views} & _TABLES):
-            raise InputError(f"{path}: {', '.join(strange)} is a view; COLMAP's databases hold tables")
-        rows = connection.execute(
-            "SELECT name, image_id FROM images WHERE image_id IN (SELECT image_id FROM keypoints)"
-        )
-        self._ids = {str(name): int(image_id) for name, image_id in rows}
+        require_tables(connection, _TABLES)
+        self._ids = self._find_images()
         self.names = sorted(self._ids)
         if not self.names:
             raise InputError(f"{path}: holds no keypoints; extract features there first")
@@ -97,17 +94,46 @@ class DatabaseSource:
         """See `corrsfm.importing.Source`."""
         return []
 
+    def _find_images(self) -> dict[str, int]:
+        """Ids by name of the images that have keypoints."""
+        found: dict[str, int] = {}
+        rows = self._connection.execute(
+            "SELECT name, image_id FROM images WHERE image_id IN (SELECT image_id FROM keypoints)"
+        )
+        for name, image_id in rows:
+            if type(image_id) is not int or type(name) is not str:
+                raise InputError(
+                    f"{self.label}: image {_shown(image_id)} is called {_shown(name)}, expected a number "
+                    f"and a text; {_AGAIN}"
+                )
+            if name in found:
+                raise InputError(f"{self.label}: {name}: is there twice; {_AGAIN}")
+            found[name] = image_id
+        return found
+
     def _find_pairs(self) -> dict[Pair, tuple[int, bool]]:
         name_of = {image_id: name for name, image_id in self._ids.items()}
         found: dict[Pair, tuple[int, bool]] = {}
         for (pair_id,) in self._connection.execute("SELECT pair_id FROM matches WHERE rows > 0"):
-            ids = divmod(int(pair_id), PAIR_BASE)
+            if type(pair_id) is not int:
+                raise InputError(
+                    f"{self.label}: matches of pair {_shown(pair_id)}, expected a whole number; {_AGAIN}"
+                )
+            ids = divmod(pair_id, PAIR_BASE)
             if not all(image_id in name_of for image_id in ids):
                 raise InputError(
-                    f"{self.label}: matches of images {ids[0]} and {ids[1]}, which have no keypoints"
+                    f"{self.label}: matches of images {ids[0]} and {ids[1]}, which have no keypoints; "
+                    f"{_AGAIN}"
                 )
             name0, name1 = (name_of[image_id] for image_id in ids)
-            found[min(name0, name1), max(name0, name1)] = int(pair_id), name0 > name1
+            pair = (min(name0, name1), max(name0, name1))
+            if name0 == name1 or pair in found:
+                what = "a photo is matched with itself" if name0 == name1 else "the pair is there twice"
+                raise InputError(
+                    f"{self.label}: {' – '.join(pair)}: {what}; delete the row of matches with pair_id "
+                    f"{pair_id}, or leave all matches with --rematch"
+                )
+            found[pair] = pair_id, name0 > name1
         return found
 
     def _descriptors(self, where: str, image_id: int, num: int) -> NDArray | None:
@@ -118,6 +144,8 @@ class DatabaseSource:
         ).fetchone()
         if row is None:
             return None if num else np.zeros((0, 0), np.float32)
+        if type(row[1]) is not int:
+            raise InputError(f"{where}: descriptors of type {_shown(row[1])}, expected a number; {_AGAIN}")
         is_sift = row[0] == _SIFT_SIZE and row[1] <= 0
         stored = self._array(where, "descriptors", image_id, np.dtype(np.uint8))
         if is_sift:
@@ -132,24 +160,33 @@ class DatabaseSource:
             f"SELECT rows, cols, data FROM {table} WHERE {column} = ?", (key,)
         ).fetchone()
         if type(num_rows) is not int or type(num_columns) is not int or not isinstance(data, bytes | None):
-            raise InputError(f"{where}: {table} are {num_rows!r} × {num_columns!r}; the database is damaged")
-        data = data or b""
-        values = np.frombuffer(data[: len(data) - len(data) % dtype.itemsize], dtype)
-        if num_rows < 0 or num_columns < 0 or len(data) != num_rows * num_columns * dtype.itemsize:
             raise InputError(
-                f"{where}: {table} of {num_rows} × {num_columns} numbers are {len(data)} bytes long; "
-                "the database is damaged"
+                f"{where}: {table} of {_shown(num_rows)} × {_shown(num_columns)} numbers are "
+                f"{type(data).__name__}, expected whole numbers and bytes; {_AGAIN}"
             )
-        return values.reshape(num_rows, num_columns or 2)
+        data = data or b""
+        if not num_rows and not data:
+            return np.zeros((0, 2), dtype)
+        if num_rows < 1 or num_columns < 1 or len(data) != num_rows * num_columns * dtype.itemsize:
+            raise InputError(
+                f"{where}: {table} of {num_rows} × {num_columns} numbers are {len(data)} bytes long; {_AGAIN}"
+            )
+        return np.frombuffer(data, dtype).reshape(num_rows, num_columns)
+
+
+def _shown(value: Any) -> str:
+    """What stands in place of a number or name, cut short."""
+    shown = repr(value[:_MOST_SHOWN] if isinstance(value, str | bytes) else value)
+    return shown if len(shown) <= 2 * _MOST_SHOWN else f"{shown[:_MOST_SHOWN]}…"
 
 
 def _shapes(
     keypoints: NDArray[np.float32],
-) -> tuple[NDArray[np.float32] | None, NDArray[np.float32] | None]:
+) -> tuple[NDArray[np.floating] | None, NDArray[np.floating] | None]:
     """Scales and orientations (N,) of COLMAP's keypoints, with 2, 4 or, as affine shapes, 6 numbers."""
     if keypoints.shape[1] == 2:
         return None, None
     if keypoints.shape[1] == 4:
         return keypoints[:, 2], keypoints[:, 3]
-    a11, a12, a21, a22 = keypoints[:, 2:].T
+    a11, a12, a21, a22 = keypoints[:, 2:].astype(np.float64).T
     return (np.hypot(a11, a21) + np.hypot(a12, a22)) / 2, np.arctan2(a21, a11)

@@ -114,3 +114,91 @@ def test_bad_databases_are_named(photos: Path, names: list[str], tmp_path: Path)
     with pytest.raises(InputError, match="cannot be read as a COLMAP database"):
         import_features(photos, tmp_path / "scene", database=tmp_path / "other.db")
     assert not (tmp_path / "scene").exists()
+
+
+def without_keys(table: str, column: str, value: str) -> list[str]:
+    """SQL that gives the rows of a table a key which its schema would not let in."""
+    return [
+        f"CREATE TABLE made AS SELECT * FROM {table}",
+        f"DROP TABLE {table}",
+        f"ALTER TABLE made RENAME TO {table}",
+        f"UPDATE {table} SET {column} = {value}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("statements", "text"),
+    [
+        (["UPDATE keypoints SET rows = 10, cols = 0, data = x''"], "keypoints of 10 × 0 numbers are 0 bytes"),
+        (["UPDATE matches SET rows = 10, cols = 0, data = x''"], "matches of 10 × 0 numbers are 0 bytes"),
+        (
+            ["UPDATE keypoints SET rows = zeroblob(5000)"],
+            r"keypoints of b'.{5,50} × 4 numbers are bytes",
+        ),
+        (["UPDATE keypoints SET rows = 1e300"], r"keypoints of 1e\+300 × 4 numbers"),
+        (["UPDATE keypoints SET data = 'abc'"], "numbers are str, expected whole numbers and bytes"),
+        (without_keys("matches", "pair_id", "'abc'"), "matches of pair 'abc', expected a whole number"),
+        (without_keys("matches", "pair_id", "NULL"), "matches of pair None, expected a whole number"),
+        (without_keys("matches", "pair_id", "1e300"), r"matches of pair 1e\+300, expected a whole number"),
+        (
+            [*without_keys("images", "image_id", "'abc'"), *without_keys("keypoints", "image_id", "'abc'")],
+            "image 'abc' is called",
+        ),
+        (["UPDATE images SET name = zeroblob(9000)"], "image 1 is called b'.{5,50}, expected"),
+        (["UPDATE images SET name = 'same'"], "same: is there twice"),
+        (
+            ["ALTER TABLE descriptors ADD COLUMN type", "UPDATE descriptors SET type = 'x'"],
+            "descriptors of type 'x', expected a number",
+        ),
+        (
+            ["UPDATE matches SET pair_id = 2147483648"],
+            "matched with itself; .* pair_id 2147483648, or",
+        ),
+        (
+            ["INSERT INTO matches SELECT 2147483647 * 2 + 1, rows, cols, data FROM matches"],
+            "the pair is there twice",
+        ),
+        (
+            ["ALTER TABLE matches RENAME TO mm", "CREATE VIEW MATCHES AS SELECT * FROM mm"],
+            "MATCHES is a view, expected a table",
+        ),
+    ],
+)
+def test_odd_rows_are_named_in_a_short_message(
+    photos: Path, names: list[str], tmp_path: Path, statements: list[str], text: str
+) -> None:
+    path = tmp_path / "database.db"
+    write_old_database(path, names)
+    edit(path, *statements)
+    with pytest.raises(InputError, match=text) as error:
+        import_features(photos, tmp_path / "scene", database=path)
+    assert str(path) in str(error.value) and len(str(error.value)) < 300 + len(str(path))
+    assert not (tmp_path / "scene").exists()
+
+
+@pytest.mark.parametrize("value", [np.nan, -1.0, 0.0, np.inf])
+def test_scales_that_are_none_are_refused(
+    photos: Path, names: list[str], tmp_path: Path, value: float
+) -> None:
+    path = tmp_path / "database.db"
+    write_old_database(path, names)
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        (data,) = database.execute("SELECT data FROM keypoints WHERE image_id = 2").fetchone()
+        keypoints = np.frombuffer(data, np.float32).reshape(NUM, 4).copy()
+        keypoints[7, 2] = value
+        database.execute("UPDATE keypoints SET data = ? WHERE image_id = 2", (keypoints.tobytes(),))
+    with pytest.raises(InputError, match=f"{names[1]}: the scale of keypoint 7 is .*; extract"):
+        import_features(photos, tmp_path / "scene", database=path)
+
+
+def test_a_view_of_another_name_does_no_harm(photos: Path, names: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "database.db"
+    write_old_database(path, names)
+    edit(path, "CREATE VIEW mine AS SELECT * FROM matches")
+    assert import_features(photos, tmp_path / "scene", database=path).num_pairs == 1
+
+
+def edit(path: Path, *statements: str) -> None:
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        for statement in statements:
+            database.execute(statement)
