@@ -97,7 +97,7 @@ def import_features(
     kind : FeatureKind or str
         What the features are, so that the network made for them is used.
     with_matches : bool
-        Whether to take the matches of a database, too.
+        Whether to take the matches of a database, too; files of hloc are given without them instead.
     images : ImagesConfig, optional
         Which photos, and what is known about their cameras.
     overwrite : bool
@@ -121,6 +121,8 @@ def import_features(
         raise ConfigError("give --features, or --database")
     if matches is not None and features is None:
         raise ConfigError("--matches belongs to --features; a database holds its own")
+    if not with_matches and database is None:
+        raise ConfigError("--rematch belongs to --database; give --features without --matches to match again")
     if images.mask_dir is not None:
         raise ConfigError("--mask-dir: imported keypoints are not masked; leave out masked ones before")
     folder = Path(workspace)
