@@ -28,6 +28,7 @@ FLOORS: list[tuple[str, set[str]]] = [
             "descriptors",
             "graph",
             "files",
+            "hdf5",
             "disk",
             "machine",
             "cluster",
@@ -66,7 +67,7 @@ ON_ONE_FLOOR: dict[tuple[str, str], str] = {
 # The rooms that may import a third-party package.
 OWNERS: dict[str, set[str]] = {
     "cv2": {"images", "features", "report", "prune", "evaluation"},
-    "h5py": {"workspace", "labelled", "importing", "export"},
+    "h5py": {"hdf5", "workspace", "labelled", "importing", "export"},
     "pycolmap": {
         "colmap", "images", "features", "pairs", "prune", "database", "reconstruction", "report",
         "export", "finished", "evaluation",

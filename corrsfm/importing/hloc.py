@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import require_file
-from corrsfm.importing.checks import features_from, matches_from
+from corrsfm.hdf5 import lies_elsewhere, open_hdf5
+from corrsfm.importing.checks import features_from, matches_from, single_precision
 from corrsfm.types import Features, Matches, Pair
-from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys, lies_elsewhere
+from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys
 
 __all__ = ["HlocSource", "open_hloc"]
 
@@ -48,11 +49,11 @@ def _open(path: Path) -> Iterator[h5py.File]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected features or matches as hloc writes them")
     require_file(path)
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read as HDF5 ({error}); write it again") from error
-    with file:
+    with contextlib.ExitStack() as stack:
+        try:
+            file = stack.enter_context(open_hdf5(path))
+        except (OSError, RuntimeError, ValueError) as error:
+            raise InputError(f"{path}: cannot be read as HDF5 ({error}); write it again") from error
         yield file
 
 
@@ -82,20 +83,18 @@ class HlocSource:
         stored = self._read(where, group, "keypoints")
         if stored.ndim != 2:
             raise InputError(f"{where}: keypoints have shape {stored.shape}, expected (N, 2)")
-        if stored.dtype == np.float16 and len(stored):
-            spacing = np.spacing(np.abs(stored).astype(np.float16)).astype(np.float64)
-            self._rounded[name] = MEAN_ROUNDING * float(np.nanmean(spacing))
         if stored.dtype.kind not in "fiu":
             raise InputError(f"{where}: keypoints are {stored.dtype}, expected numbers")
-        size = self._optional(group, "image_size")
+        size = self._optional(where, group, "image_size")
         if size is not None and not (size.size >= 2 and np.isfinite(size.ravel()[:2]).all()):
             raise InputError(f"{where}: image_size is {size.ravel()[:2]}, expected width and height")
         if size is not None and tuple(int(value) for value in size.ravel()[:2]) != image_size:
+            width, height = (float(value) for value in size.ravel()[:2])
             raise InputError(
-                f"{where}: features of a photo of {int(size.ravel()[0])} × {int(size.ravel()[1])} pixels, "
+                f"{where}: features of a photo of {width:g} × {height:g} pixels, "
                 f"this one has {image_size[0]} × {image_size[1]}; give the photos that they are of"
             )
-        descriptors = self._optional(group, "descriptors")
+        descriptors = self._optional(where, group, "descriptors")
         if descriptors is None and self._matches is None:
             raise InputError(
                 f"{where}: has no 'descriptors', only {', '.join(sorted(group))}; give --matches, too"
@@ -106,17 +105,21 @@ class HlocSource:
                     f"{where}: descriptors have shape {descriptors.shape}, expected (D, {len(stored)}): one "
                     "column for each keypoint"
                 )
-            descriptors = descriptors.T.astype(np.float32)
-        scores = self._optional(group, "scores")
-        return features_from(
+            descriptors = single_precision(descriptors.T)
+        scores = self._optional(where, group, "scores")
+        features = features_from(
             where,
-            stored.astype(np.float32) + HALF_PIXEL,
+            single_precision(stored) + HALF_PIXEL,
             descriptors,
             image_size,
             scores=None if scores is None else scores.ravel(),
-            scales=self._optional(group, "scales"),
-            orientations=self._optional(group, "oris"),
+            scales=self._optional(where, group, "scales"),
+            orientations=self._optional(where, group, "oris"),
         )
+        if stored.dtype == np.float16 and len(stored):
+            spacing = np.spacing(np.abs(stored).astype(np.float16)).astype(np.float64)
+            self._rounded[name] = MEAN_ROUNDING * float(np.mean(spacing))
+        return features
 
     def matches(self, pair: Pair, num0: int, num1: int) -> Matches:
         """See `corrsfm.importing.Source`."""
@@ -132,7 +135,7 @@ class HlocSource:
                 f"{where}: matches of {len(stored)} keypoints, but the first photo has {num0}; the matches "
                 "belong to other features"
             )
-        scores = self._optional(group, "matching_scores0")
+        scores = self._optional(where, group, "matching_scores0")
         if scores is not None and scores.size != stored.size:
             raise InputError(f"{where}: {stored.size} matches, but {scores.size} scores")
         rows = np.flatnonzero(stored != -1)
@@ -186,7 +189,7 @@ class HlocSource:
             item = group.get(key)
             if not isinstance(item, h5py.Dataset):
                 raise InputError(f"{where}: has no '{key}', only {', '.join(sorted(group))}")
-            if lies_elsewhere(item, group.file):
+            if lies_elsewhere(item):
                 raise InputError(
                     f"{where}: the values of '{key}' lie in another file; copy them into this one"
                 )
@@ -200,8 +203,8 @@ class HlocSource:
         except (OSError, RuntimeError, LookupError, TypeError, ValueError) as error:
             raise InputError(f"{where}: '{key}' cannot be read ({error}); write the file again") from error
 
-    def _optional(self, group: h5py.Group, key: str) -> NDArray[Any] | None:
-        return self._read(f"{group.file.filename}: {group.name}", group, key) if key in group else None
+    def _optional(self, where: str, group: h5py.Group, key: str) -> NDArray[Any] | None:
+        return self._read(where, group, key) if key in group else None
 
 
 def _surest(

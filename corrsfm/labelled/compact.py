@@ -42,6 +42,7 @@ from corrsfm.colmap.cameras import normalise_by_pinhole
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
+from corrsfm.hdf5 import lies_elsewhere
 from corrsfm.labelled.oanet import OANetPair, open_pairs, select_per_scene
 from corrsfm.types import Camera
 
@@ -292,8 +293,10 @@ def read_scenes(path: Path) -> list[CompactScene]:
 def _read_scene(path: Path, name: str, file: h5py.File) -> CompactScene:
     try:
         group = file[name]
-        if not isinstance(group, h5py.Group) or group.file.filename != file.filename:
-            raise ValueError("is no scene of this file")
+        if not isinstance(group, h5py.Group):
+            raise ValueError("is no scene")
+        if outside := [key for key in group if lies_elsewhere(group[key])]:
+            raise ValueError(f"the values of '{outside[0]}' lie in another file")
         if (num_bytes := sum(group[key].nbytes for key in group)) > _LARGEST_SCENE_BYTES:
             raise ValueError(f"declares {num_bytes / 1e9:,.0f} GB")
         scene = _decode(name, group)
@@ -326,6 +329,8 @@ def _check_numbers(scene: CompactScene) -> None:
         raise ValueError("arrays do not fit each other")
     if not (np.isfinite(scene.rotations).all() and np.isfinite(scene.translations).all()):
         raise ValueError("a pose is not finite")
+    if not np.isfinite(scene.corrections).all() or np.isinf(scene.log_scales).any():
+        raise ValueError("a correction or scale of a keypoint is not finite")
     if ((scene.pairs < 0) | (scene.pairs >= num_images)).any():
         raise ValueError("a pair names a photo that is not there")
     if (np.diff(scene.match_offsets) != num_keypoints[scene.pairs[:, 0]]).any():

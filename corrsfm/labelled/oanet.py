@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import h5py
 import numpy as np
@@ -29,6 +29,7 @@ from corrsfm.colmap.cameras import pinhole_parameters
 from corrsfm.errors import InputError
 from corrsfm.files import atomic_path, require_file
 from corrsfm.geometry import INLIER_THRESHOLD
+from corrsfm.hdf5 import lies_elsewhere, open_hdf5
 from corrsfm.types import Camera, Correspondences
 
 __all__ = [
@@ -38,6 +39,8 @@ __all__ = [
     "select_per_scene",
     "write_pairs",
 ]
+
+F = TypeVar("F", bound=np.floating)
 
 _REQUIRED = ("xs", "ys", "Rs", "ts", "ratios", "mutuals", "cx1s", "cy1s", "cx2s", "cy2s", "f1s", "f2s")
 
@@ -146,7 +149,7 @@ def open_pairs(path: Path) -> Iterator[h5py.File]:
     """
     require_file(path)
     try:
-        with h5py.File(path, "r") as handle:
+        with open_hdf5(path) as handle:
             yield handle
     except (OSError, RuntimeError, LookupError, ValueError, TypeError, MemoryError) as error:
         raise InputError(
@@ -166,12 +169,20 @@ def _indices(handle: h5py.File, path: Path) -> list[str]:
     return sorted(handle["xs"], key=lambda name: (len(name), name))
 
 
+def _stored(handle: h5py.File, group: str, index: str) -> NDArray[Any]:
+    """One quantity of a pair; raises `ValueError` if its values are not in this file."""
+    dataset = handle[group][index]
+    if lies_elsewhere(dataset):
+        raise ValueError(f"the values of '{group}' lie in another file")
+    return np.asarray(dataset)
+
+
 def _camera(handle: h5py.File, index: str, image: int) -> Camera:
     """Camera of image 0 or 1, called 1 and 2 in the file."""
-    focal = np.asarray(handle[f"f{image + 1}s"][index], np.float64).ravel()
-    centre = [float(np.asarray(handle[f"c{axis}{image + 1}s"][index]).ravel()[0]) for axis in "xy"]
+    focal = np.asarray(_stored(handle, f"f{image + 1}s", index), np.float64).ravel()
+    centre = [float(_stored(handle, f"c{axis}{image + 1}s", index).ravel()[0]) for axis in "xy"]
     if "sizes" in handle and index in handle["sizes"]:
-        width, height = (int(side) for side in handle["sizes"][index][image])
+        width, height = (int(side) for side in _stored(handle, "sizes", index)[image])
     else:
         # The published layout has no size. A centred principal point gives it, and nothing that is
         # computed from a pinhole camera depends on it.
@@ -186,25 +197,29 @@ def _camera(handle: h5py.File, index: str, image: int) -> Camera:
 
 
 def _scene(handle: h5py.File, index: str) -> str:
-    return handle["scenes"][index].asstr()[()] if "scenes" in handle and index in handle["scenes"] else ""
+    if "scenes" not in handle or index not in handle["scenes"]:
+        return ""
+    if lies_elsewhere(dataset := handle["scenes"][index]):
+        raise ValueError("the values of 'scenes' lie in another file")
+    return str(dataset.asstr()[()])
 
 
 def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
-    points = np.asarray(handle["xs"][index], np.float32).reshape(-1, 4)
-
-    def column(group: str) -> NDArray[Any]:
-        if group not in handle or index not in handle[group]:
-            return np.zeros(len(points), np.float32)
-        values = np.asarray(handle[group][index])
-        # Some published files keep two label distances per match; the epipolar one comes first.
-        return values.reshape(len(points), -1)[:, 0] if len(points) else np.zeros(0, np.float32)
-
     try:
+        points = _finite(_stored(handle, "xs", index).astype(np.float32).reshape(-1, 4), "xs")
+
+        def column(group: str) -> NDArray[Any]:
+            if group not in handle or index not in handle[group]:
+                return np.zeros(len(points), np.float32)
+            values = _stored(handle, group, index)
+            # Some published files keep two label distances per match; the epipolar one comes first.
+            return values.reshape(len(points), -1)[:, 0] if len(points) else np.zeros(0, np.float32)
+
         return OANetPair(
             correspondences=points,
             label_distances=column("ys").astype(np.float32),
-            rotation=np.asarray(handle["Rs"][index], np.float64).reshape(3, 3),
-            translation=np.asarray(handle["ts"][index], np.float64).reshape(3),
+            rotation=_finite(_stored(handle, "Rs", index).astype(np.float64).reshape(3, 3), "Rs"),
+            translation=_finite(_stored(handle, "ts", index).astype(np.float64).reshape(3), "ts"),
             ratios=column("ratios").astype(np.float32),
             mutual=column("mutuals") > 0.5,
             log_scale_ratios=column("log_scale_ratios").astype(np.float32),
@@ -216,6 +231,12 @@ def _read_pair(handle: h5py.File, index: str, path: Path) -> OANetPair:
         )
     except (InputError, LookupError, TypeError, ValueError) as error:
         raise InputError(f"{path}: pair {index} is damaged or incomplete ({error})") from error
+
+
+def _finite(values: NDArray[F], group: str) -> NDArray[F]:
+    if not np.isfinite(values).all():
+        raise ValueError(f"'{group}' holds what is not a finite number")
+    return values
 
 
 def read_pairs(path: Path, *, max_per_scene: int | None = None, seed: int = 0) -> Iterator[OANetPair]:

@@ -19,10 +19,12 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from corrsfm.colmap.sqlite import require_tables
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import read_json
+from corrsfm.hdf5 import lies_elsewhere, open_hdf5
 from corrsfm.types import Features, Matches, TwoViewModel
-from corrsfm.workspace.hloc import HALF_PIXEL, lies_elsewhere
+from corrsfm.workspace.hloc import HALF_PIXEL
 from corrsfm.workspace.items import FEATURES, MATCHES, PRUNED, Kind, PrunedMatches
 from corrsfm.workspace.store import ItemStore
 
@@ -131,7 +133,7 @@ def _is_own(path: Path) -> bool:
 def _rows(path: Path) -> Iterator[Row]:
     if not path.exists():
         return
-    with h5py.File(path, "r") as file:
+    with open_hdf5(path) as file:
         found: list[str] = []
         file.visititems(
             lambda name, item: (
@@ -140,12 +142,12 @@ def _rows(path: Path) -> Iterator[Row]:
         )
         for name in found:
             group = file[name]
-            arrays = {key: _own(value, file)[()] for key, value in group.items()}
+            arrays = {key: _own(value)[()] for key, value in group.items()}
             yield name, str(group.attrs["fingerprint"]), arrays, dict(group.attrs)
 
 
-def _own(dataset: h5py.Dataset, file: h5py.File) -> h5py.Dataset:
-    if lies_elsewhere(dataset, file):
+def _own(dataset: h5py.Dataset) -> h5py.Dataset:
+    if lies_elsewhere(dataset):
         raise ValueError("its values lie in another file")
     return dataset
 
@@ -155,6 +157,7 @@ def _rows_of_journal(path: Path) -> Iterator[Row]:
     if not path.exists():
         return
     with contextlib.closing(sqlite3.connect(path)) as connection, contextlib.suppress(sqlite3.DatabaseError):
+        require_tables(connection, ("items",))
         for key, fingerprint, item in connection.execute("SELECT key, fingerprint, item FROM items"):
             try:
                 with np.load(io.BytesIO(item), allow_pickle=False) as stored:

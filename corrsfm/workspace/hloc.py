@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-import h5py
 import numpy as np
 
 from corrsfm.errors import InputError
 from corrsfm.types import Pair
 
-__all__ = ["HALF_PIXEL", "check_hloc_keys", "lies_elsewhere", "pair_group"]
+__all__ = ["HALF_PIXEL", "check_hloc_keys", "pair_group"]
 
 HALF_PIXEL = np.float32(0.5)
 """hloc's keypoints have the centre of the first pixel at (0, 0)."""
@@ -19,11 +18,6 @@ HALF_PIXEL = np.float32(0.5)
 def pair_group(pair: Pair) -> str:
     """The HDF5 group of a pair: ``name0/name1`` with slashes inside a name as dashes."""
     return "/".join(name.replace("/", "-") for name in pair)
-
-
-def lies_elsewhere(dataset: h5py.Dataset, file: h5py.File) -> bool:
-    """Whether the values of a dataset would be read from another file, which may be any of this machine."""
-    return bool(dataset.is_virtual or dataset.external or dataset.file.filename != file.filename)
 
 
 def check_hloc_keys(names: Iterable[str]) -> None:

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import logging
+import os
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path
@@ -49,6 +50,16 @@ def edit(path: Path, name: str, key: str, value: object) -> None:
         del file[name][key]
         if value is not None:
             file[name][key] = value
+
+
+def add_shapes(path: Path, name: str, *, scale: float = 2.0, angle: float = 0.5) -> None:
+    """Scales and orientations of all photos, of which one keypoint of one photo has these."""
+    with h5py.File(path, "r+") as file:
+        for photo in file:
+            scales, angles = np.full(NUM, 2.0), np.full(NUM, 0.5)
+            if photo == name:
+                scales[3], angles[3] = scale, angle
+            file[photo]["scales"], file[photo]["oris"] = scales, angles
 
 
 def test_features_come_in_with_half_a_pixel_and_without_what_they_lack(
@@ -184,6 +195,32 @@ def test_half_precision_keypoints_are_warned_of(
             r"shape \(40, 3\)",
         ),
         (lambda path, name: edit(path, name, "scores", np.zeros(3, np.float32)), r"scores have shape \(3,\)"),
+        (
+            lambda path, name: edit(path, name, "keypoints", np.full((NUM, 2), 1e300)),
+            "keypoint 0 is not a finite number",
+        ),
+        (
+            lambda path, name: edit(path, name, "descriptors", np.full((SIZE, NUM), 1e300)),
+            "descriptor 0 is not a finite number",
+        ),
+        (
+            lambda path, name: edit(path, name, "descriptors", np.full((SIZE, NUM), 1e30)),
+            "length of descriptor 0 is not a finite number",
+        ),
+        (
+            lambda path, name: edit(path, name, "scores", np.full(NUM, np.inf)),
+            "score of keypoint 0 is not a finite number",
+        ),
+        (lambda path, name: add_shapes(path, name, scale=np.nan), "scale of keypoint 3 is nan.*extract"),
+        (lambda path, name: add_shapes(path, name, scale=-1), "scale of keypoint 3 is -1, expected a finite"),
+        (lambda path, name: add_shapes(path, name, scale=0), "scale of keypoint 3 is 0"),
+        (lambda path, name: add_shapes(path, name, scale=1e300), "scale of keypoint 3 is inf"),
+        (lambda path, name: add_shapes(path, name, scale=1e-300), "scale of keypoint 3 is 0"),
+        (
+            lambda path, name: add_shapes(path, name, angle=np.inf),
+            "orientation of keypoint 3 is not",
+        ),
+        (lambda path, name: add_shapes(path, name, angle=np.nan), "or give them without scales"),
     ],
 )
 def test_bad_features_are_refused_and_leave_nothing(
@@ -235,6 +272,44 @@ def test_bad_matches_are_refused_and_leave_nothing(
     assert not (tmp_path / "scene").exists()
 
 
+def test_infinite_scores_of_matches_are_refused(
+    photos: Path, features: Path, names: list[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "matches.h5"
+    write_matches(path, [(names[0], names[1])])
+    with h5py.File(path, "r+") as file:
+        file[f"{names[0]}/{names[1]}/matching_scores0"][2] = np.inf
+    with pytest.raises(InputError, match=f"{names[0]} – {names[1]}: the score of match 1 is infinite"):
+        import_features(photos, tmp_path / "scene", features=features, matches=path)
+
+
+def test_a_link_into_another_file_is_refused_before_anything_behind_it_is_opened(
+    photos: Path, features: Path, names: list[str], tmp_path: Path
+) -> None:
+    os.mkfifo(tmp_path / "pipe.h5")  # opening it would not end
+    with h5py.File(features, "r+") as file:
+        del file[names[0]]["keypoints"]
+        file[names[0]]["keypoints"] = h5py.ExternalLink("pipe.h5", "/x")
+    with pytest.raises(InputError, match=f"features.h5: .*{names[0]}/keypoints is a link into another file"):
+        import_features(photos, tmp_path / "scene", features=features)
+
+
+def test_names_that_are_not_text_are_refused(photos: Path, names: list[str], tmp_path: Path) -> None:
+    write_features(tmp_path / "features.h5", names)
+    with h5py.File(tmp_path / "features.h5", "r+") as file:
+        file.create_group(b"p\xff\xfe.jpg")["keypoints"] = np.zeros((NUM, 2))
+    with pytest.raises(InputError, match=r"features\.h5: .*the name 'p\\xff\\xfe\.jpg' is not UTF-8"):
+        import_features(photos, tmp_path / "scene", features=tmp_path / "features.h5")
+
+
+def test_errors_name_a_photo_as_it_is_called(
+    photos: Path, features: Path, names: list[str], tmp_path: Path
+) -> None:
+    edit(features, names[0], "scores", np.full(NUM, b"a"))
+    with pytest.raises(InputError, match=f"features.h5: {names[0]}: 'scores' is"):
+        import_features(photos, tmp_path / "scene", features=features)
+
+
 def test_pairs_of_other_photos_twice_or_of_one_photo_are_refused(
     photos: Path, features: Path, names: list[str], tmp_path: Path
 ) -> None:
@@ -261,6 +336,8 @@ def test_a_workspace_with_features_keeps_them(photos: Path, features: Path, tmp_
 def test_one_source_must_be_given(photos: Path, features: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="give --features, or --database"):
         import_features(photos, tmp_path / "scene")
+    with pytest.raises(ConfigError, match="--rematch belongs to --database"):
+        import_features(photos, tmp_path / "scene", features=features, with_matches=False)
     with pytest.raises(InputError, match="cannot be read as HDF5"):
         (tmp_path / "text.h5").write_text("no")
         import_features(photos, tmp_path / "scene", features=tmp_path / "text.h5")

@@ -1,7 +1,9 @@
 """The compact pair file: what goes in comes out within the quantisation, labels included."""
 
+import os
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from labelled_scene import make_scene
@@ -73,3 +75,28 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
     (tmp_path / "text.h5").write_text("no")
     with pytest.raises(InputError, match=r"text\.h5: cannot be read as HDF5 .*corrsfm train prepare"):
         read_scenes(tmp_path / "text.h5")
+
+
+def test_what_would_be_read_from_another_file_is_refused(tmp_path):
+    path = tmp_path / "pairs.h5"
+    os.mkfifo(tmp_path / "pipe.h5")  # opening it would not end
+    virtual = h5py.VirtualLayout((5, 2), "u2", maxshape=(None, 2))
+    every = slice(0, h5py.h5s.UNLIMITED)
+    virtual[every, :] = h5py.VirtualSource("pipe.h5", "x", (5, 2), maxshape=(None, 2))[every, :]
+    for plant, text in (
+        (
+            lambda group: group.__setitem__("pairs", h5py.ExternalLink("pipe.h5", "/x")),
+            "pairs is a link",
+        ),
+        (
+            lambda group: group.create_virtual_dataset("pairs", virtual),
+            "values of 'pairs' lie",
+        ),
+        (lambda group: group.create_dataset(b"\xff", data=1), "is not UTF-8"),
+    ):
+        write_scenes(path, [make_scene()])
+        with h5py.File(path, "r+") as file:
+            del file["yard/pairs"]
+            plant(file["yard"])
+        with pytest.raises(InputError, match=text):
+            read_scenes(path)

@@ -119,6 +119,15 @@ def test_a_damaged_pair_is_named(tmp_path: Path):
         list(read_pairs(tmp_path / "yfcc.h5"))
 
 
+@pytest.mark.parametrize("group", ["xs", "Rs", "ts", "f1s", "cx2s"])
+def test_a_number_that_is_not_finite_is_named(tmp_path: Path, group: str):
+    _write_published(tmp_path / "yfcc.h5")
+    with h5py.File(tmp_path / "yfcc.h5", "a") as handle:
+        handle[group]["7"][...] = np.nan
+    with pytest.raises(InputError, match=r"yfcc\.h5: pair 7 is damaged"):
+        list(read_pairs(tmp_path / "yfcc.h5"))
+
+
 @pytest.mark.parametrize(
     ("model", "params"),
     [
