@@ -88,7 +88,15 @@ def _read(folder: Path) -> pycolmap.Reconstruction:
         if path.name in _SIZES:
             _check_end(path.name, content, promised)
     with colmap_log():
-        return pycolmap.Reconstruction(str(folder))
+        model = pycolmap.Reconstruction(str(folder))
+    for image_id, image in model.images.items():
+        try:
+            image.name  # noqa: B018
+        except UnicodeDecodeError as error:
+            raise ValueError(
+                f"the name of photo {image_id} is not UTF-8: {ascii(error.object[:60])}"
+            ) from None
+    return model
 
 
 def _size_of_image(content: bytes, start: int) -> int:

@@ -83,3 +83,11 @@ def test_a_model_that_finds_no_room_is_refused_and_one_cut_short_is_noticed(
     with files_of_at_most(1 << 11), pytest.raises(OSError, match="not whole") as cut:
         write_model(given, tmp_path / "out", as_text=as_text)
     assert cut.value.errno == errno.ENOSPC
+
+
+def test_names_that_are_not_text_are_refused(model: Path) -> None:
+    name = read_model(model).images[1].name.encode()
+    content = (model / "images.bin").read_bytes()
+    (model / "images.bin").write_bytes(content.replace(name, b"\xff\xfe" + name[2:]))
+    with pytest.raises(InputError, match=r"cannot be read \(the name of photo 1 is not UTF-8: b'\\xff\\xfe"):
+        read_model(model)
