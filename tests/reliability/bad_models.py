@@ -94,6 +94,7 @@ def _ways() -> dict[str, Callable[[Path], None]]:
     image = "1 1 0 0 0 0 0 0 1 0.jpg\n10 10 -1\n2 1 0 0 0 1 0 0 1 1.jpg\n10 10 -1\n"
     point = "1 0 0 1 0 0 0 0 1 0 2 0\n"
     return found | {
+        "images name bytes": on("images.bin", lambda content: content.replace(b"1.jpg\0", b"\xff\xfejpg\0")),
         "text model unknown": text(cameras="1 MAGIC 160 120 1\n", images=image, points3D=point),
         "text camera few": text(cameras="1 SIMPLE_PINHOLE 160 120 130\n", images=image, points3D=point),
         "text camera nan": text(cameras="1 SIMPLE_PINHOLE 160 120 nan nan nan\n", images=image, points3D=point),

@@ -211,6 +211,12 @@ def _ways_of_json(path: Path) -> dict[str, Callable]:
     return ways
 
 
+_ENDLESS = (
+    "CREATE VIEW {} AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n FROM c)"
+    " SELECT n AS pair_id, n AS rows, n AS number, n AS key, n AS name, n AS value FROM c"
+)
+
+
 def _ways_of_stores(name: str) -> dict[str, Callable]:
     """Rows that were changed by SQL, and whole rows of wrong arrays with right checksums."""
     if not name.endswith(".db"):
@@ -230,6 +236,10 @@ def _ways_of_stores(name: str) -> dict[str, Callable]:
             "names": "UPDATE images SET name = 'x' || name",
             "moved keypoints": "UPDATE keypoints SET data = zeroblob(length(data)) WHERE image_id = 3",
             "no table": "DROP TABLE matches",
+            "view": f"ALTER TABLE matches RENAME TO old; {_ENDLESS.format('Matches')}",
+            "view of geometries": f"ALTER TABLE two_view_geometries RENAME TO old; {_ENDLESS.format('two_view_geometries')}",
+            "trigger": "CREATE TRIGGER t AFTER INSERT ON two_view_geometries BEGIN DELETE FROM two_view_geometries; END",
+            "name bytes": "UPDATE images SET name = CAST(x'ff2e6a7067' AS TEXT) WHERE image_id = 2",
             "no tables": "DROP TABLE cameras",
         }
     else:
@@ -250,6 +260,9 @@ def _ways_of_stores(name: str) -> dict[str, Callable]:
             "about": "DELETE FROM about",
             "kind": "UPDATE about SET value = 'x' WHERE name = 'kind'",
             "no table": "DROP TABLE arrays",
+            "view": f"ALTER TABLE items RENAME TO old; {_ENDLESS.format('items')}",
+            "view about": f"ALTER TABLE about RENAME TO old; {_ENDLESS.format('about')}",
+            "trigger": "CREATE TRIGGER t AFTER INSERT ON items BEGIN DELETE FROM items; END",
             "version": "PRAGMA user_version = 99",
             "application": "PRAGMA application_id = 1",
             "high number": "UPDATE items SET number = 9223372036854775807 WHERE number = 2",
