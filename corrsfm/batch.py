@@ -337,8 +337,8 @@ def _terminable() -> Iterator[None]:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Open a file; a pipe that nobody reads is refused in place of waited for."""
-    return os.open(path, flags | os.O_NONBLOCK, 0o666)
+    """Open a file; a pipe that nobody reads is refused in place of waited for, and a link not followed."""
+    return os.open(path, flags | os.O_NONBLOCK | os.O_NOFOLLOW, 0o666)
 
 
 def run_one(
@@ -360,7 +360,8 @@ def run_one(
     try:
         handle = open(log, "w", encoding="utf-8", opener=_open_at_once)  # noqa: SIM115
     except OSError as error:
-        code, message = 1, f"Error: {log}: cannot be written ({error.strerror}); the scene was not run"
+        why = "is a link" if log.is_symlink() else error.strerror
+        code, message = 1, f"Error: {log}: cannot be written ({why}); the scene was not run"
     else:
         with handle:
             # The pipe closes with this process, and the scene's process ends.

@@ -318,8 +318,10 @@ def require_replaceable(path: Path, what: str, *beginnings: bytes) -> None:
     InputError
         If another file is there, or it cannot be read.
     """
-    if not path.is_file():
+    if path.is_dir() or not os.path.lexists(path):
         return
+    if not path.is_file():
+        raise InputError(f"{path}: is a pipe, a device or a link that leads nowhere; choose another name")
     with open_file(path) as file:
         head = file.read(max(map(len, beginnings)))
     if head and not head.startswith(beginnings):

@@ -191,6 +191,34 @@ def test_a_pipe_in_place_of_a_log_is_not_waited_for(tmp_path: Path, monkeypatch:
     assert "a.batch.log: cannot be written (" in statuses[0].message
 
 
+def test_a_link_in_place_of_a_log_is_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    (tmp_path / "diary").write_text("precious")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a.batch.log").symlink_to(tmp_path / "diary")
+    (status,) = run_collection(collection(tmp_path, "a"), tmp_path / "out")
+    assert not status.succeeded and "a.batch.log: cannot be written (is a link)" in status.message
+    assert (tmp_path / "diary").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["extra"], "extra: expected options of corrsfm run"),
+        (["--method", "ratio", "more", "words"], "more, words: expected options"),
+        (["--bogus"], "No such option '--bogus'"),
+        (["--max-features", "x"], "'x' is not a valid integer"),
+    ],
+)
+def test_words_that_no_run_would_take_are_refused_before_any_scene(
+    tmp_path: Path, words: list[str], text: str
+) -> None:
+    photos, output = collection(tmp_path, "a"), tmp_path / "out"
+    result = CliRunner().invoke(main, ["batch", str(photos), str(output), *words])
+    assert result.exit_code == 2 and text in result.stderr
+    assert not output.exists()
+
+
 def test_a_scene_that_was_killed_is_told_from_one_that_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,3 +158,11 @@ def test_a_file_is_replaced_by_one_of_its_kind_alone(tmp_path: Path) -> None:
     path.write_bytes(b"\xff\xd8\xff")
     with pytest.raises(InputError, match=r"results\.json: exists and is not a result file; choose another"):
         require_replaceable(path, "a result file", b"{", b"[")
+
+
+def test_pipes_and_links_that_lead_nowhere_are_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    (tmp_path / "link.json").symlink_to(tmp_path / "nowhere")
+    for name in ("pipe.json", "link.json"):
+        with pytest.raises(InputError, match=f"{name}: is a pipe, a device or a link that leads nowhere"):
+            require_replaceable(tmp_path / name, "a result file", b"{")

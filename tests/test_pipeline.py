@@ -385,6 +385,21 @@ def test_a_broken_link_is_an_unreadable_photo(workspace: Workspace, photos: Path
     assert outcome.num_items == 4
 
 
+@pytest.mark.parametrize("skip", [False, True])
+def test_features_are_of_the_photos_that_were_listed(tmp_path: Path, skip: bool) -> None:
+    photos = tmp_path / "photos"
+    write_photos(photos, 3)
+    workspace = Workspace(tmp_path / "scene", create=True)
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=skip), RUN)
+    shutil.copy(photos / "0.png", photos / "2.png")
+    with pytest.raises(InputError, match=r"2\.png: has changed since the photos were listed\nrun the"):
+        pipeline.extract_features(workspace, cfg.FeaturesConfig(max_features=60), RUN)
+    # The one that has changed is not taken for one that cannot be read.
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=skip), RUN)
+    outcome = pipeline.extract_features(workspace, cfg.FeaturesConfig(max_features=60), RUN)
+    assert (outcome.num_items, outcome.num_reused) == (3, 2)
+
+
 def test_a_truncated_photo_is_left_out_on_request(
     workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

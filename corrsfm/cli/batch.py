@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from corrsfm.cli.options import OVERWRITE_KEY, PATH, echo_json, json_option
+from corrsfm.errors import first_few
 
 __all__ = ["batch"]
 
@@ -35,6 +36,7 @@ def batch(
     """
     from corrsfm.batch import run_collection
 
+    _check_arguments(run_arguments)
     click.get_current_context().meta[OVERWRITE_KEY] = "--overwrite" in run_arguments
     statuses = run_collection(collection, output, run_arguments, jobs=jobs, dask=dask)
     if as_json:
@@ -49,3 +51,16 @@ def batch(
         )
     if all(status.empty for status in statuses):
         raise click.ClickException(f"{collection}: no photos in any of {len(statuses)} folders")
+
+
+def _check_arguments(run_arguments: tuple[str, ...]) -> None:
+    """Refuse once what `corrsfm run` would refuse for every scene, and words that it takes for folders."""
+    from corrsfm.cli.stages import run
+
+    folders = ["PHOTOS", "WORKSPACE"]
+    with run.make_context("corrsfm run", [*folders, *run_arguments]) as context:
+        given = [str(path) for path in (*context.params["photos"], context.params["workspace_dir"])]
+    if stray := given[len(folders) :]:
+        raise click.UsageError(
+            f"{first_few(stray)}: expected options of corrsfm run after the collection and the output"
+        )

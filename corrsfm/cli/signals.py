@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a command clears up, says how to go on, and ends with the status that shells give."""
+"""Ctrl-C, SIGTERM and SIGHUP: a command clears up, says how to go on, and ends with the status of shells."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ __all__ = ["Interruption", "interrupted_by", "interruptible"]
 AGAIN_AFTER_SECONDS = 0.05
 # Native code may not return for minutes; who sent SIGTERM sends SIGKILL after ten seconds or so.
 CLEARING_UP_SECONDS = 8.0
+_ENDING = (signal.SIGTERM, signal.SIGHUP)
 
 
 class Interruption(click.ClickException):
@@ -37,7 +38,7 @@ class Interruption(click.ClickException):
     """
 
     def __init__(self, number: int, how_to_go_on: str) -> None:
-        word = "terminated" if number == signal.SIGTERM else "interrupted"
+        word = "interrupted" if number == signal.SIGINT else "terminated"
         super().__init__(f"{word}; {how_to_go_on}")
         self.exit_code = 128 + number  # type: ignore[misc]
 
@@ -80,14 +81,15 @@ def interrupted_by() -> int:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """Let SIGTERM raise `KeyboardInterrupt` as Ctrl-C does, and remember either.
+    """Let SIGTERM and SIGHUP raise `KeyboardInterrupt` as Ctrl-C does, and remember which it was.
 
     A library may turn the exception into another error or drop it. Signals that are ignored, as Ctrl-C is in
     background jobs of a shell, or that the caller handles, stay as they are; and all of them outside the main
     thread.
     """
     _caught.number = 0
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    usual: dict[int, Any] = {signal.SIGINT: signal.default_int_handler}
+    usual |= dict.fromkeys(_ENDING, signal.SIG_DFL)
     in_main_thread = threading.current_thread() is threading.main_thread()
     ours = {
         number: was for number, was in usual.items() if in_main_thread and signal.getsignal(number) is was
@@ -128,7 +130,7 @@ def _be_quiet() -> None:
 
 @contextlib.contextmanager
 def _watching() -> Iterator[None]:
-    """End this process a few seconds after SIGTERM, should native code not let Python handle it."""
+    """End this process a few seconds after SIGTERM or SIGHUP, should native code not let Python handle it."""
     inner, outer = socket.socketpair()
     with inner, outer:
         outer.setblocking(False)
@@ -143,12 +145,12 @@ def _watching() -> Iterator[None]:
 
 def _end_in_time(numbers: socket.socket) -> None:
     # It is for the main thread, which may hold it back.
-    signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     with numbers:
         while received := numbers.recv(1):
-            if received[0] == signal.SIGTERM:
+            if received[0] in _ENDING:
                 time.sleep(CLEARING_UP_SECONDS)
-                os._exit(128 + signal.SIGTERM)
+                os._exit(128 + received[0])
 
 
 class _PycolmapFinder:

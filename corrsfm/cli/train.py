@@ -116,7 +116,8 @@ def export(source: Path, output: Path, half: bool, adjust: Callable[[NetworkUsag
     from corrsfm.model import load_network, read_provenance, save_network
 
     checkpoint = source / "latest.pt" if source.is_dir() else source
-    if output.exists() and output.samefile(checkpoint):
+    # One that comes with corrsfm has no path.
+    if output.exists() and checkpoint.exists() and output.samefile(checkpoint):
         raise InputError(f"{output}: is what is exported; choose another name")
     network = load_network(checkpoint)
     network.usage = adjust(network.usage)

@@ -252,7 +252,7 @@ def _check_output(path: Path, workspace: Workspace, photos: Path, *, is_file: bo
         if place.is_relative_to(folder.resolve()):
             raise InputError(f"{path}: lies in the folder of {what}; choose another place")
     if is_file:
-        if path.exists():
+        if os.path.lexists(path):
             raise InputError(f"{path}: exists already; choose another name for the file, or remove it")
     elif path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; expected a folder to export to")

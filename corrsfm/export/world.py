@@ -16,6 +16,8 @@ __all__ = ["common_up", "crop_to_bulk", "held_upright", "scale_of", "similarity"
 
 # Mean length of the cameras' up axes; below it they point everywhere.
 _LEAST_AGREEMENT = 0.5
+# From a grain of dust to the way to the moon: coordinates stay numbers of single precision.
+NEAREST_M, FARTHEST_M = 1e-6, 1e9
 # Mean square of the horizontal axes along the second direction: about 8 degrees of turning.
 _LEAST_TURNING = 0.02
 # Outer share of the points on each side of an axis that does not count as bulk.
@@ -108,8 +110,10 @@ def scale_of(model: pycolmap.Reconstruction, photo0: str, photo1: str, metres: f
     missing = [name for name in (photo0, photo1) if name not in poses]
     if missing:
         raise InputError(f"--scale: not in the model: {first_few(missing)}; it has {first_few(poses)}")
-    if not (np.isfinite(metres) and metres > 0):
-        raise InputError(f"--scale: a distance of {metres} m; expected a positive number")
+    if not NEAREST_M <= metres <= FARTHEST_M:
+        raise InputError(
+            f"--scale: a distance of {metres:g} m; expected one from {NEAREST_M:g} to {FARTHEST_M:g} m"
+        )
     distance = np.linalg.norm(camera_centre(poses[photo0]) - camera_centre(poses[photo1]))
     extent = np.ptp([camera_centre(pose) for pose in poses.values()], axis=0).max()
     if distance <= 1e-6 * extent or distance == 0:

@@ -15,8 +15,9 @@ from corrsfm import config as cfg
 from corrsfm.cluster import connected
 from corrsfm.colmap.log import colmap_log
 from corrsfm.config import config_hash
-from corrsfm.errors import ClusterError, CorrsfmError, ImageError
+from corrsfm.errors import ClusterError, CorrsfmError, ImageError, InputError
 from corrsfm.features import algorithm_of, create_extractor, reads_colour
+from corrsfm.files import sha256_of
 from corrsfm.images.photos import read_colour, read_image, read_mask
 from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.types import Features, ImageRecord
@@ -48,6 +49,8 @@ def extract_features(
     ------
     ImageError
         Naming every photo that cannot be read; the features of the others are kept.
+    InputError
+        Naming photos that have changed since they were indexed.
     WorkspaceError
         If the features were imported and a photo has none.
     ConfigError
@@ -86,22 +89,29 @@ def extract_features(
     may_skip = bool(images.config.get("skip_unreadable"))
 
     def produce(missing: list[str]) -> Iterator[tuple[str, Features | None]]:
-        unreadable = []
+        unreadable, changed = [], []
         results = make_items(cluster, workspace, store, work, missing, records.__getitem__, wanted, run)
         for name, result in results:
             if not isinstance(result, CorrsfmError):
                 yield name, result
+            elif not isinstance(result, ImageError):
+                changed.append(str(result))
             elif may_skip:
                 logger.warning("left out: %s", result)
                 wanted[name] = of_left_out[name]
                 yield name, _no_features(index, records[name])
             else:
                 unreadable.append(str(result))
+        if changed:
+            raise InputError(
+                "\n".join(sorted(changed)) + "\nrun the command again; the features of the others are kept"
+            )
         if unreadable:
+            # `corrsfm add` leaves out none of the photos that were named.
+            skip = "" if workspace.adding.exists() else ", or use --skip-unreadable"
             raise ImageError(
-                "\n".join(sorted(unreadable))
-                + "\nremove or replace these photos and run again, or use --skip-unreadable; the features of "
-                "the others are kept"
+                "\n".join(sorted(unreadable)) + f"\nremove or replace these photos and run again{skip}; the "
+                "features of the others are kept"
             )
 
     log = colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext()
@@ -134,7 +144,7 @@ def _extract(
     config: cfg.FeaturesConfig,
     mask_dir: str | None,
     algorithm: str,
-) -> Iterator[tuple[str, Features | ImageError]]:
+) -> Iterator[tuple[str, Features | InputError]]:
     """Extract the features of photos, here or on a worker, which must have the same libraries."""
     if algorithm_of(config) != algorithm:
         raise ClusterError(f"extracts by {algorithm_of(config)}, the run by {algorithm}; install the same")
@@ -142,10 +152,20 @@ def _extract(
     extract = create_extractor(config, device)
     read = read_colour if reads_colour(config.extractor) else read_image
 
-    def work(record: ImageRecord) -> Features | ImageError:
+    def work(record: ImageRecord) -> Features | InputError:
+        path, mask_path = workspace.images_dir / record.name, None
+        if mask_dir and record.mask:
+            mask_path = Path(mask_dir) / record.mask
         try:
-            image = read(workspace.images_dir / record.name)
-            mask = read_mask(Path(mask_dir) / record.mask, image.shape) if mask_dir and record.mask else None
+            image = read(path)
+            mask = read_mask(mask_path, image.shape) if mask_path else None
+        except ImageError as error:
+            return error
+        # After the pixels were read, so that the features are of the photo that the record names.
+        for read_from, sha256 in ((path, record.sha256), (mask_path, record.mask_sha256)):
+            if read_from is not None and sha256_of(read_from) != sha256:
+                return InputError(f"{read_from}: has changed since the photos were listed")
+        try:
             return extract(image, mask)
         except ImageError as error:
             return error

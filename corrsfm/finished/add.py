@@ -22,7 +22,7 @@ from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
 from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
-from corrsfm.files import atomic_write_json, read_json
+from corrsfm.files import atomic_write_json, read_json, sha256_of
 from corrsfm.finished.advice import next_step
 from corrsfm.finished.arrival import (
     Pending,
@@ -195,6 +195,7 @@ class _Addition:
 
     def __init__(self, workspace: Workspace, pending: Pending, run: cfg.RunConfig) -> None:
         self._workspace = workspace
+        self._hashes = pending.photos
         self._new = sorted(pending.photos)
         self._recorded = pending.options
         self._refine = pending.refine
@@ -245,6 +246,13 @@ class _Addition:
         fresh = {name: paths.get(name, folder / name) for name in self._new if name not in index.names}
         config = self._options("images", cfg.ImagesConfig)
         cache = PhotoCache(workspace.photo_cache)
+        there = {record.name: record.sha256 for record in index.records}
+        there |= {name: sha256_of(path) for name, path in fresh.items()}
+        if exchanged := [name for name, sha256 in self._hashes.items() if there[name] != sha256]:
+            raise InputError(
+                f"{folder}: no longer the photos that were to be added: {first_few(exchanged)}; put those "
+                "back, or remove what is in their place, and run the same command again"
+            )
         return grown_index(index, fresh, folder, config, cache) if fresh else index
 
     def _index(self) -> StageOutcome:

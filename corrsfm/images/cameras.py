@@ -192,7 +192,8 @@ def _parse_params(model: str, params: str) -> list[float]:
     # Not finite, or so large that mapping would never end.
     if len(values) != len(expected) or not (np.abs(values) < _LARGEST_PARAMETER).all():
         raise ConfigError(
-            f"camera_params is '{params}', expected the numbers {', '.join(expected)} for {model}"
+            f"camera_params is '{params}', expected the numbers {', '.join(expected)} for {model}, each "
+            f"below {_LARGEST_PARAMETER:g}"
         )
     return values
 

@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
+from corrsfm.disk import is_closed, opening
 from corrsfm.errors import InputError, first_few
 from corrsfm.files import read_lines, why_unusable
 from corrsfm.images.photos import CONVERTED_SUFFIXES
@@ -135,14 +136,32 @@ def _without_twins(names: Sequence[str]) -> list[str]:
 def holds_pictures(folder: Path) -> bool:
     """Whether a folder or its sub-folders hold any photo or video, readable here or not."""
     suffixes = (*IMAGE_SUFFIXES, *_FOREIGN_SUFFIXES, *VIDEO_SUFFIXES)
-    return any(name.lower().endswith(suffixes) for name in _visible_files(folder))
+    try:
+        files = _visible_files(folder)
+    except InputError:
+        return True
+    return any(name.lower().endswith(suffixes) for name in files)
+
+
+def _refuse(error: OSError) -> None:
+    """A folder that cannot be looked into may hold photos."""
+    path = Path(error.filename)
+    if is_closed(path):
+        raise InputError(opening(path)) from error
+    raise InputError(f"{path}: cannot be looked into ({error.strerror}); open it, or move it away") from error
 
 
 def _visible_files(folder: Path) -> list[str]:
-    """Posix names of all files that are not hidden; links to folders are followed, but never twice."""
+    """Posix names of all files that are not hidden; links to folders are followed, but never twice.
+
+    Raises
+    ------
+    InputError
+        If a folder may not be read.
+    """
     names: list[str] = []
     visited = set()
-    for root, folders, files in os.walk(folder, followlinks=True):
+    for root, folders, files in os.walk(folder, followlinks=True, onerror=_refuse):
         real = os.path.realpath(root)
         if real in visited:
             folders.clear()

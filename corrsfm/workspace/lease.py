@@ -190,12 +190,25 @@ def _open(path: Path) -> FileIO:
             f"{path}: is a folder, pipe or device, expected a file; run: {removal}"
         ) from error
     except OSError as error:
+        if isinstance(error, PermissionError) and _is_of_another(path.parent):
+            opening = shlex.join(["sudo", "chmod", "-R", "a+rwX", str(path.parent)])
+            raise WorkspaceError(
+                f"{path.parent}: belongs to another user and may not be written; work on a copy of the folder, "
+                f"or open it, with: {opening}"
+            ) from error
         if is_of_the_disk(error):
             copy = ", or work on a copy of the folder" if isinstance(error, PermissionError) else ""
             raise WorkspaceError(f"{explain(error)}{copy}") from error
         raise WorkspaceError(
             f"{path.parent}: nothing can be written there ({error.strerror}); work on a copy of the folder"
         ) from error
+
+
+def _is_of_another(folder: Path) -> bool:
+    try:
+        return folder.stat().st_uid != os.geteuid()
+    except OSError:
+        return False
 
 
 def _lock(file: FileIO, path: Path) -> bool | None:

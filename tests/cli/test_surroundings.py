@@ -94,7 +94,10 @@ def test_other_errors_of_ours_are_not_taken_for_a_lack_of_memory() -> None:
             raise CorrsfmError("no such file") from None
 
 
-@pytest.mark.parametrize(("number", "word"), [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated")])
+@pytest.mark.parametrize(
+    ("number", "word"),
+    [(signal.SIGINT, "interrupted"), (signal.SIGTERM, "terminated"), (signal.SIGHUP, "terminated")],
+)
 def test_a_signal_ends_a_command_in_one_line_and_with_the_status_of_shells(
     tmp_path: Path, number: signal.Signals, word: str
 ) -> None:

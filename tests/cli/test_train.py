@@ -21,6 +21,11 @@ def test_a_missing_recipe_is_named(tmp_path: Path) -> None:
     assert f"{tmp_path / 'none.toml'}: no such file; expected a training recipe" in result.stderr
 
 
+def test_a_network_that_comes_with_corrsfm_can_be_exported_again(tmp_path: Path) -> None:
+    command = ["train", "export", "small-mutual", str(tmp_path / "x.pt")]
+    assert [CliRunner().invoke(main, command).exit_code for _ in range(2)] == [0, 0]
+
+
 def test_export_keeps_what_a_checkpoint_says_but_for_the_flags_given(tmp_path: Path) -> None:
     config = NetworkConfig(channels=8, clusters=4, heads=2, mlp_ratio=1, side_channels=5)
     save_network(CorrAdaptor.from_config(config), tmp_path / "silent.pt", provenance={"steps": 3})

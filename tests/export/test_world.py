@@ -124,7 +124,8 @@ def test_two_photos_set_the_scale_and_the_result_leads_back(scene: FinishedScene
     [
         ("1.png", "nowhere.png", 1.0, "not in the model: nowhere.png; it has 1.png"),
         ("1.png", "1.png", 1.0, "taken at one place"),
-        ("1.png", "2.png", 0.0, "a distance of 0.0 m"),
+        ("1.png", "2.png", 0.0, "a distance of 0 m; expected one from 1e-06 to 1e\\+09 m"),
+        ("1.png", "2.png", 1e300, r"a distance of 1e\+300 m"),
         ("1.png", "2.png", float("nan"), "a distance of nan m"),
     ],
 )

@@ -247,6 +247,25 @@ def test_an_interruption_while_models_are_replaced_loses_none(
     assert [photo.model for photo in result.photos] == [0, 0]
 
 
+def test_a_photo_exchanged_during_an_addition_is_named_and_nothing_is_made_of_it(
+    scene: SceneToGrow, grown: SceneToGrow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(adding._Addition, "finish", interrupt)
+        add_photos(scene.workspace, scene.new, run=RUN)
+    name = scene.new_names[0]
+    for content in ((scene.new / scene.new_names[1]).read_bytes(), b"cut"):
+        (scene.photos / name).write_bytes(content)
+        with pytest.raises(InputError, match=f"no longer the photos that were to be added: {name}"):
+            add_photos(scene.workspace, run=RUN)
+    (scene.photos / name).unlink()
+    add_photos(scene.workspace, scene.new, run=RUN)
+    assert raw(scene.model()) == raw(grown.model())
+
+
 @pytest.mark.parametrize(
     "content", ["[]", '{"photos": 5, "options": {}}', '{"photos": {"a": 1}, "options": {}}']
 )

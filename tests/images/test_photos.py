@@ -1,5 +1,6 @@
 """Photos of all kinds are listed and read, or refused by name."""
 
+import errno
 import os
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from corrsfm.config import ImagesConfig
 from corrsfm.errors import ImageError, InputError
 from corrsfm.files import sha256_of
 from corrsfm.images.index import duplicate_images, index_images, name_remarks
-from corrsfm.images.listing import list_images
+from corrsfm.images.listing import holds_pictures, list_images
 from corrsfm.images.photos import read_image, read_mask, read_photo_info
 
 
@@ -54,6 +55,26 @@ def test_linked_folders_are_followed_and_loops_end(folder: Path, tmp_path: Path)
     (folder / "link").symlink_to(tmp_path / "elsewhere", target_is_directory=True)
     (folder / "sub" / "loop").symlink_to(folder, target_is_directory=True)
     assert list_images(folder) == ["a.PNG", "b.jpg", "link/z.jpg", "sub/a.jpg", "sub/deep/Übung 1.TIFF"]
+
+
+def test_a_folder_that_may_not_be_read_is_not_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "closed").mkdir()
+    (tmp_path / "a.jpg").touch()
+    (tmp_path / "b.jpg").touch()
+    scan = os.scandir
+
+    # Tests may run as root, who may read anything.
+    def refuse(path: str) -> object:
+        if str(path).endswith("closed"):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), path)
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    with pytest.raises(InputError, match="closed"):
+        list_images(tmp_path)
+    assert holds_pictures(tmp_path / "closed")
 
 
 def test_an_image_list_chooses_photos(folder: Path, tmp_path: Path) -> None:
