@@ -193,7 +193,7 @@ def _open(path: Path) -> FileIO:
         if isinstance(error, PermissionError) and _is_of_another(path.parent):
             opening = shlex.join(["sudo", "chmod", "-R", "a+rwX", str(path.parent)])
             raise WorkspaceError(
-                f"{path.parent}: belongs to another user and may not be written; work on a copy of the folder, "
+                f"{path.parent}: belongs to another user and may not be written; work on a copy of it, "
                 f"or open it, with: {opening}"
             ) from error
         if is_of_the_disk(error):
