@@ -110,11 +110,28 @@ def _size_of_point(content: bytes, start: int) -> int:
     return int(51 + 8 * track_length)
 
 
-# Bytes of an entry that begins at a place of a file, as COLMAP describes its binary format: photo id, pose,
-# camera id, name, points; point id, position, colour, error, track.
+def _size_of_frame(content: bytes, start: int) -> int:
+    (num_data,) = struct.unpack_from("<I", content, start + 64)
+    return int(68 + 16 * num_data)
+
+
+def _size_of_rig(content: bytes, start: int) -> int:
+    (num_sensors,) = struct.unpack_from("<I", content, start + 4)
+    place = start + (16 if num_sensors else 8)
+    for _ in range(num_sensors - 1):
+        (has_pose,) = struct.unpack_from("<B", content, place + 8)
+        place += 65 if has_pose else 9
+    return place - start
+
+
+# Bytes of an entry that begins at a place of a file, as COLMAP writes it: photo id, pose, camera id, name,
+# points; point id, position, colour, error, track; frame id, rig id, pose, photos; rig id, sensors, of which
+# all but the first have poses or none.
 _SIZES: dict[str, Callable[[bytes, int], int]] = {
+    "frames.bin": _size_of_frame,
     "images.bin": _size_of_image,
     "points3D.bin": _size_of_point,
+    "rigs.bin": _size_of_rig,
 }
 
 

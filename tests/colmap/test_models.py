@@ -25,7 +25,27 @@ def model(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["images.bin", "points3D.bin"])
+def test_rigs_of_several_cameras_and_of_cameras_without_a_pose_are_read(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=2, num_cameras_per_rig=3, num_frames_per_rig=2, num_points3D=20
+    )
+    made = pycolmap.synthesize_dataset(options)
+    rig = pycolmap.Rig()
+    rig.rig_id = 77
+    for camera_id in (98, 99):
+        camera = pycolmap.Camera.create_from_model_name(camera_id, "PINHOLE", 500, 640, 480)
+        made.add_camera(camera)
+        if camera_id == 98:
+            rig.add_ref_sensor(camera.sensor_id)
+        else:
+            rig.add_sensor(camera.sensor_id, None)
+    made.add_rig(rig)
+    made.write_binary(tmp_path)
+    read = read_model(tmp_path)
+    assert (read.num_rigs(), read.num_frames(), read.num_images()) == (3, 4, 12)
+
+
+@pytest.mark.parametrize("name", ["frames.bin", "images.bin", "points3D.bin", "rigs.bin"])
 def test_files_that_end_elsewhere_than_their_entries_are_refused(model: Path, name: str) -> None:
     assert read_model(model).num_points3D() == 30
     whole = (model / name).read_bytes()
