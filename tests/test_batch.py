@@ -275,7 +275,7 @@ def test_what_a_killed_batch_was_doing_ends_with_it_and_the_next_one_goes_on(tmp
 
 def test_an_output_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "out").touch()
-    with pytest.raises(WorkspaceError, match=r"out: cannot be made \(.*\); choose another folder"):
+    with pytest.raises(WorkspaceError, match=r"out: cannot be made \(.*\); or choose another folder"):
         run_collection(collection(tmp_path, "a"), tmp_path / "out")
 
 

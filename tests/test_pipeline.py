@@ -612,6 +612,24 @@ def test_a_truncated_database_is_written_again(
     assert pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
 
 
+def test_a_database_that_lost_rows_is_written_again(
+    workspace: Workspace, photos: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    verify(workspace, photos)
+    before = read_keypoint_counts(workspace.database)
+    with contextlib.closing(sqlite3.connect(workspace.database)) as connection:
+        connection.execute("DELETE FROM keypoints")
+        connection.commit()
+    assert not pipeline.verify_matches(workspace, cfg.DatabaseConfig(), RUN).skipped
+    assert "database.db: damaged (not as it was written); it is written again" in caplog.text
+    assert read_keypoint_counts(workspace.database) == before and len(before) == 4
+
+
+def read_keypoint_counts(database: Path) -> list[tuple[int, int]]:
+    with contextlib.closing(sqlite3.connect(database)) as connection:
+        return connection.execute("SELECT image_id, rows FROM keypoints ORDER BY image_id").fetchall()
+
+
 def colours(workspace: Workspace) -> set[tuple[int, ...]]:
     (model,) = read_models(workspace.sparse)
     return {tuple(point.color.tolist()) for point in model.points3D.values()}

@@ -54,9 +54,12 @@ def verify_matches(
     fingerprint = fingerprint_of(workspace, config, run.seed)
     pair_list = read_pairs(workspace)
     damaged = _damage(workspace.database, thorough=run.verify)
+    current = workspace.is_current("verified matches", fingerprint, workspace.database)
+    # What it remembers of its pairs says nothing of what was lost of photos and keypoints.
+    if not (damaged or current) and workspace.database in workspace.changed_files("verified matches"):
+        damaged = "not as it was written" if workspace.database.exists() else ""
     if damaged:
         logger.warning("%s: damaged (%s); it is written again", workspace.database, damaged)
-    current = workspace.is_current("verified matches", fingerprint, workspace.database)
     if current and not overwrite and not damaged:
         return StageOutcome(
             stage="verified matches", num_items=len(pair_list), num_reused=len(pair_list), skipped=True

@@ -368,6 +368,9 @@ def try_damage(
         # A store that check names need not be read by a run that has nothing to do.
         but = damage.path if steps else ""
         faults += _differences(scene, expected, f"run after {damage.path}", but)
+        # But nothing may keep it from being named afterwards.
+        if but and not _damage_steps(run(["check", "scene", "--json"])):
+            faults += _differences(scene, expected, f"hidden by a run: {damage.path}")
     # 3. The advice: what check names, or else what the run said.
     reset()
     rounds = 0

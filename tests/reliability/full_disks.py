@@ -135,9 +135,8 @@ def try_full_disk(disk: FullDisk, base: Path, folder: Path, expected: dict[str, 
         outcome = run_command(words, folder)
         (work / _FILLER).unlink()
         after = {name: what for name, what in contents(work).items() if not _KEPT_ITEMS.search(name)}
-        named = [writer.makes, "scene"]
         writes = [writer.makes, *(["photos"] if disk.command == "add" else [])]
-        trial = Trial(arguments=words, named=named, writes=writes, expected=EITHER, begins=True)
+        trial = Trial(arguments=words, named=[*writes, "scene"], writes=writes, expected=EITHER, begins=True)
         faults = find_faults(trial, outcome, before, after, contents(folder / "tmp"))
         said = outcome.err + outcome.out
         if outcome.code:
