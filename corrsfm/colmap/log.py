@@ -66,8 +66,9 @@ def _folder_beside(log_file: Path) -> Iterator[Path]:
     """An empty folder with a name of its own, so that what a killed process left is found and removed."""
     folder = log_file.with_name(f".{log_file.name}.partial")
     shutil.rmtree(folder, ignore_errors=True)
-    make_folder(folder)
+    # Ctrl-C may come as soon as it is there.
     try:
+        make_folder(folder)
         yield folder
     finally:
         shutil.rmtree(folder, ignore_errors=True)

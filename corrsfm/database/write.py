@@ -308,10 +308,14 @@ def _check_not_in_use(path: Path) -> None:
         if path.stat().st_size and not is_sqlite(path):
             raise DatabaseError(f"{path}: is not a COLMAP database; move it away and try again")
         return
+    if not path.exists():
+        # Logs of a database that is gone are of no use to anybody, and SQLite would replay them.
+        for file in side_files:
+            file.unlink(missing_ok=True)
+        return
     # Opening and closing merges the log of a killed process.
     with colmap_log(), database_errors(path):
-        if path.exists():
-            pycolmap.Database.open(path).close()
+        pycolmap.Database.open(path).close()
     if any(file.exists() for file in side_files):
         raise DatabaseError(
             f"{path}: is in use by another program; close it there (COLMAP, another corrsfm) and try again"

@@ -54,7 +54,10 @@ def find_damage(workspace: Workspace) -> list[Damage]:
         In the order of the stages.
     """
     reader = _Reader(workspace)
-    found = []
+    found = [
+        Damage(path=path, problem=problem, remedy=_put_in_place(path))
+        for path, problem in workspace.obstacles().items()
+    ]
     for stage, (path, read) in reader.stages().items():
         if workspace.record_of(stage) is None:
             continue
@@ -86,11 +89,15 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             remedy = command_again(workspace, stage)
             if path.exists():
                 remedy = f"{shlex.join(['rm', '-r', str(path)])}; {remedy}"
-        # Nothing is written through them.
-        if links := [str(one) for one in changed if one.is_symlink()]:
-            remedy = f"{shlex.join(['rm', *links])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return [*found, *_changed_records(workspace)]
+
+
+def _put_in_place(path: Path) -> str:
+    """The command that puts what a link leads to in its place, or takes away what leads nowhere."""
+    if path.is_symlink() and path.exists():
+        return shlex.join(["cp", "-r", "--remove-destination", str(path.resolve()), str(path)])
+    return shlex.join(["rm", "-r", str(path)])
 
 
 def _changed_records(workspace: Workspace) -> list[Damage]:

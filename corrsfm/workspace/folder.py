@@ -211,6 +211,15 @@ class Workspace(Ledger):
         places = {path for path in vars(self).values() if isinstance(path, Path) and path.parent == self.root}
         return sorted({path.name for path in places - {self.converted}} | {"pruned"})
 
+    def obstacles(self) -> dict[Path, str]:
+        """What keeps every command from writing here, with the reason: links, and no file for the lock."""
+        links = [path for name in self._own_names if (path := self.root / name).is_symlink()]
+        found = dict.fromkeys(links, "is a link, and nothing is written through links")
+        lock = self.root / ".lock"
+        if os.path.lexists(lock) and (lock.is_symlink() or not lock.is_file()):
+            found[lock] = "is no file, expected one"
+        return found
+
     def place_aside(self) -> Path:
         """Where models go that others replace: the first free one of ``sparse.old``, ``sparse.old.2``, …"""
         names = ("sparse.old" if number == 1 else f"sparse.old.{number}" for number in itertools.count(1))

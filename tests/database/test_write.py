@@ -276,6 +276,15 @@ def test_database_locked_by_another_process_is_said_to_be_in_use(tmp_path: Path,
     assert len(read_verified_pairs(path)) == 2
 
 
+@pytest.mark.parametrize("suffix", ["-wal", "-shm", "-journal"])
+def test_a_log_whose_database_is_gone_is_in_nobodys_way(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / "database.db"
+    log = tmp_path / f"database.db{suffix}"
+    log.touch()
+    write(path)
+    assert len(read_verified_pairs(path)) == 2 and not log.exists()
+
+
 def test_database_open_in_another_process_is_not_replaced(tmp_path: Path, hold) -> None:
     path = tmp_path / "database.db"
     write(path)

@@ -129,6 +129,29 @@ def test_a_whole_scene_has_no_damage(workspace: Path) -> None:
     assert result["num_registered"] > 2 and result["is_usable"]
 
 
+@pytest.mark.parametrize("name", ["features.db", "evidence.json", ".photos.json"])
+def test_links_in_a_workspace_are_named_with_what_takes_their_place(
+    workspace: Path, name: str, tmp_path: Path
+) -> None:
+    elsewhere, place = tmp_path / "elsewhere", workspace / name
+    place.rename(elsewhere)
+    place.symlink_to(elsewhere)
+    (damage,) = find_damage(Workspace(workspace))
+    assert damage.path == place and damage.problem.startswith("is a link")
+    assert damage.remedy == f"cp -r --remove-destination {elsewhere} {place}"
+    elsewhere.unlink()
+    first = find_damage(Workspace(workspace))[0]
+    assert first.path == place and first.remedy == f"rm -r {place}"
+
+
+def test_what_lies_in_the_place_of_the_lock_is_named(workspace: Path) -> None:
+    lock = workspace / ".lock"
+    lock.unlink()
+    lock.mkdir()
+    (damage,) = find_damage(Workspace(workspace))
+    assert damage.path == lock and damage.remedy == f"rm -r {lock}"
+
+
 def test_a_report_that_was_removed_is_no_damage(workspace: Path) -> None:
     Workspace(workspace).report_html.unlink()
     assert find_damage(Workspace(workspace)) == []

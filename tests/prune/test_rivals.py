@@ -102,3 +102,5 @@ def test_methods_to_compare_name_the_network_and_its_file():
     config = parse_prune_method("ms2dgnet@pose:weights/ms.pth", PruneConfig())
     assert config.method is PruneMethod.MS2DGNET and str(config.model) == "weights/ms.pth"
     assert config.operating_point is OperatingPoint.POSE
+    with pytest.raises(ConfigError, match="'ratio:x.pt': ratio reads no checkpoint; leave it out"):
+        parse_prune_method("ratio:x.pt", PruneConfig())

@@ -190,7 +190,7 @@ def parse_prune_method(text: str, base: PruneConfig) -> PruneConfig:
     Raises
     ------
     ConfigError
-        If the method or operating point is unknown.
+        If the method or operating point is unknown, or a checkpoint is given to a method that reads none.
     """
     match = _PRUNER.fullmatch(text)
     methods, points = [str(m) for m in PruneMethod], [str(p) for p in OperatingPoint]
@@ -199,6 +199,10 @@ def parse_prune_method(text: str, base: PruneConfig) -> PruneConfig:
             f"no prune method '{text}'; expected METHOD[@POINT][:CHECKPOINT] with METHOD of "
             f"{', '.join(methods)} and POINT of {', '.join(points)}"
         )
+    (model,) = (entry for entry in dataclasses.fields(PruneConfig) if entry.name == "model")
+    _, with_network = model.metadata["used_with"]
+    if match["model"] and match["method"] not in with_network:
+        raise ConfigError(f"'{text}': {match['method']} reads no checkpoint; leave it out")
     return dataclasses.replace(
         base,
         method=PruneMethod(match["method"]),
