@@ -19,7 +19,7 @@ from corrsfm.workspace.lists import read_index
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["models_of"]
+__all__ = ["are_changed", "copy_aside", "models_of", "others_in_models"]
 
 logger = logging.getLogger("corrsfm")
 
