@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from corrsfm.cluster import Cluster
 from corrsfm.config import load_pipeline
-from corrsfm.disk import explain, is_of_the_disk
+from corrsfm.disk import why_not
 from corrsfm.errors import ClusterError, CorrsfmError, InputError, WorkspaceError, printable
 from corrsfm.files import read_json
 from corrsfm.images.listing import holds_pictures
@@ -203,8 +203,7 @@ def run_collection(
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        why = explain(error) if is_of_the_disk(error) else f"{output}: cannot be made ({error.strerror})"
-        raise WorkspaceError(f"{why}; or choose another folder") from error
+        raise WorkspaceError(f"{why_not(error, output, 'made')}; or choose another folder") from error
     threads = _threads_argument(arguments, min(jobs, len(scenes))) if dask is None else []
     tasks = [
         # Not resolved: a link that leads nowhere is the trouble of its scene alone.

@@ -11,7 +11,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["explain", "is_closed", "is_of_the_disk", "opening", "require_room", "room_for"]
+__all__ = ["explain", "is_closed", "is_of_the_disk", "opening", "require_room", "room_for", "why_not"]
 
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _CLOSED = (errno.EACCES, errno.EPERM)
@@ -57,6 +57,11 @@ def explain(error: OSError, path: Path | str | None = None) -> str:
     if error.errno in _CLOSED:
         return opening(Path(os.fsdecode(named))) if named else f"{shown}: {error.strerror}"
     return f"{shown}: {error.strerror}"
+
+
+def why_not(error: OSError, path: Path, what: str) -> str:
+    """Why something cannot be written or made, whether the disk is the cause, see `explain`, or the name."""
+    return explain(error, path) if is_of_the_disk(error) else f"{path}: cannot be {what} ({error.strerror})"
 
 
 def _read_only(path: Path) -> str:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from corrsfm.disk import explain, is_of_the_disk
+from corrsfm.disk import explain, is_of_the_disk, why_not
 from corrsfm.errors import InputError, WorkspaceError
 
 __all__ = [
@@ -31,11 +31,12 @@ __all__ = [
     "read_json",
     "read_lines",
     "read_text",
+    "replaced_name",
     "require_file",
     "require_replaceable",
-    "sha256_of",
     "share_file",
     "sync_folder",
+    "unfinished_name",
     "why_unusable",
 ]
 
@@ -90,19 +91,19 @@ def _unfinished(path: Path) -> Path:
     """Where a file or folder is written before it gets its name; nothing is there."""
     if path.name in ("", ".."):
         raise WorkspaceError(f"{path}: is a folder; expected the name of what to write in it")
-    temporary = path.with_name(f".{path.name}.corrsfm.partial")
+    temporary = unfinished_name(path)
     try:
         make_folder(path.parent)
         _remove(temporary)
     except OSError as error:
-        raise WorkspaceError(_unwritten(error, path, "; choose another place")) from error
+        advice = "" if is_of_the_disk(error) else "; choose another place"
+        raise WorkspaceError(why_not(error, path, "written") + advice) from error
     return temporary
 
 
-def _unwritten(error: OSError, path: Path, advice: str = "") -> str:
-    if is_of_the_disk(error):
-        return explain(error, path)
-    return f"{path}: cannot be written ({error.strerror}){advice}"
+def unfinished_name(path: Path) -> Path:
+    """Where something is while it is written; `corrsfm.disk.explain` names what it will become."""
+    return path.with_name(f".{path.name}.corrsfm.partial")
 
 
 def make_folder(folder: Path) -> None:
@@ -171,7 +172,7 @@ def _writing(path: Path, before_replacing: Callable[[], None] = lambda: None) ->
         with atomic_path(path, before_replacing=before_replacing) as temporary:
             yield temporary
     except OSError as error:
-        raise WorkspaceError(_unwritten(error, path)) from error
+        raise WorkspaceError(why_not(error, path, "written")) from error
 
 
 def atomic_write_json(path: Path, value: Any, *, before_replacing: Callable[[], None] = lambda: None) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 
 from corrsfm.colmap.models import poses_of
-from corrsfm.disk import explain, is_of_the_disk
+from corrsfm.disk import why_not
 from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.export import ExportTarget
 from corrsfm.export.colmap import write_colmap, write_colmap3
@@ -29,7 +29,7 @@ from corrsfm.geometry import Pose
 from corrsfm.images.photos import read_photo_info
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
-from corrsfm.workspace.models import are_changed, models_of
+from corrsfm.workspace.models import changed_models, models_of
 
 __all__ = ["ExportResult", "export_scene"]
 
@@ -177,11 +177,7 @@ def _export_models(
                 temporary.mkdir()
             _writers(source, photos, upright or fit is not None)[target](model, temporary)
     except OSError as error:
-        if is_of_the_disk(error):
-            raise WorkspaceError(f"{explain(error, path)}; nothing is left there") from error
-        raise WorkspaceError(
-            f"{path}: cannot be written ({error.strerror}); nothing is left there"
-        ) from error
+        raise WorkspaceError(f"{why_not(error, path, 'written')}; nothing is left there") from error
     return ExportResult(
         target=target,
         output=path,
@@ -262,7 +258,7 @@ def _check_output(path: Path, workspace: Workspace, photos: Path, *, is_file: bo
 
 def _verdict_of(workspace: Workspace) -> str | None:
     """The grade of the model; logged with reasons and a next step unless it is good."""
-    if are_changed(workspace):
+    if changed_models(workspace):
         return None
     try:
         verdict = read_json(workspace.evidence)["verdict"]

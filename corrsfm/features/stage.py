@@ -159,13 +159,10 @@ def _extract(
         try:
             image = read(path)
             mask = read_mask(mask_path, image.shape) if mask_path else None
-        except ImageError as error:
-            return error
-        # After the pixels were read, so that the features are of the photo that the record names.
-        for read_from, sha256 in ((path, record.sha256), (mask_path, record.mask_sha256)):
-            if read_from is not None and sha256_of(read_from) != sha256:
-                return InputError(f"{read_from}: has changed since the photos were listed")
-        try:
+            # After the pixels were read, so that the features are of the photo that the record names.
+            for read_from, sha256 in ((path, record.sha256), (mask_path, record.mask_sha256)):
+                if read_from is not None and sha256_of(read_from) != sha256:
+                    return InputError(f"{read_from}: has changed since the photos were listed")
             return extract(image, mask)
         except ImageError as error:
             return error

@@ -22,7 +22,7 @@ from corrsfm.database.stage import fingerprint_of as database_fingerprint
 from corrsfm.database.write import add_to_database
 from corrsfm.errors import InputError, first_few
 from corrsfm.features.stage import extract_features
-from corrsfm.files import atomic_write_json, read_json, sha256_of
+from corrsfm.files import atomic_write_json, read_json
 from corrsfm.finished.advice import next_step
 from corrsfm.finished.arrival import (
     Pending,
@@ -247,7 +247,7 @@ class _Addition:
         config = self._options("images", cfg.ImagesConfig)
         cache = PhotoCache(workspace.photo_cache)
         there = {record.name: record.sha256 for record in index.records}
-        there |= {name: sha256_of(path) for name, path in fresh.items()}
+        there |= {name: cache.hash_of(path) for name, path in fresh.items()}
         if exchanged := [name for name, sha256 in self._hashes.items() if there[name] != sha256]:
             raise InputError(
                 f"{folder}: no longer the photos that were to be added: {first_few(exchanged)}; put those "

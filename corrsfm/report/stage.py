@@ -21,7 +21,7 @@ from corrsfm.types import Pair, PairStatistics, check_indices
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.lists import read_added, read_index, read_pairs
-from corrsfm.workspace.models import models_of
+from corrsfm.workspace.models import changed_models, models_of
 from corrsfm.workspace.resume import photos_left_out, require_database
 from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 from corrsfm.workspace.warned import BEFORE_STAGES, collect_warnings, read_warnings
@@ -80,7 +80,7 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
                 "%s: not as it was written; corrsfm check %s says how it is made again", path, workspace.root
             )
     models = models_of(workspace, changed) if "models" in records else []
-    is_judged = "models" in records and not any(path.is_relative_to(workspace.sparse) for path in changed)
+    is_judged = "models" in records and not changed_models(workspace, changed)
     names = read_index(workspace).names
     summary = make_report(
         scene=workspace.root.resolve().name,

@@ -18,7 +18,7 @@ from io import FileIO
 from pathlib import Path
 
 from corrsfm import config as cfg
-from corrsfm.disk import explain, is_of_the_disk
+from corrsfm.disk import why_not
 from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
 from corrsfm.files import OWN_RECORD
 from corrsfm.workspace.entries import check_entries
@@ -100,10 +100,7 @@ class Workspace(Ledger):
         try:
             self.root.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            why = (
-                explain(error) if is_of_the_disk(error) else f"{self.root}: cannot be made ({error.strerror})"
-            )
-            raise WorkspaceError(why) from error
+            raise WorkspaceError(why_not(error, self.root, "made")) from error
         self._values = {"format_version": FORMAT_VERSION, "images_dir": None, "stages": {}}
         self._write()
 

@@ -19,7 +19,7 @@ from corrsfm.workspace.lists import read_index
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["are_changed", "copy_aside", "models_of", "others_in_models"]
+__all__ = ["changed_models", "copy_aside", "models_of", "others_in_models"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -46,9 +46,21 @@ for point in model.points3D.values():
 """
 
 
-def are_changed(workspace: Workspace) -> bool:
-    """Whether the models are not those that corrsfm wrote and judged."""
-    return any(path.is_relative_to(workspace.sparse) for path in workspace.changed_files("models"))
+def changed_models(workspace: Workspace, changed: Iterable[Path] | None = None) -> list[Path]:
+    """Folders of the models that are not those that corrsfm wrote and judged.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    changed : iterable of Path, optional
+        What `Workspace.changed_files` found, if the caller has asked already.
+    """
+    inside = (
+        path.relative_to(workspace.sparse)
+        for path in (workspace.changed_files("models") if changed is None else changed)
+        if path.is_relative_to(workspace.sparse)
+    )
+    return sorted({workspace.sparse / path.parts[0] for path in inside})
 
 
 def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> list[pycolmap.Reconstruction]:
@@ -59,21 +71,15 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
 
     Parameters
     ----------
-    workspace : Workspace
-    changed : iterable of Path, optional
-        What `Workspace.changed_files` found, if the caller has asked already.
+    workspace, changed
+        As for `changed_models`.
 
     Raises
     ------
     WorkspaceError
         If there is none, or one cannot be read.
     """
-    places = {
-        workspace.sparse / path.relative_to(workspace.sparse).parts[0]
-        for path in (workspace.changed_files("models") if changed is None else changed)
-        if path.is_relative_to(workspace.sparse)
-    }
-    for folder in sorted(places):
+    for folder in changed_models(workspace, changed):
         if not _can_be_read(folder):
             remedy = workspace.command_for("models", "--overwrite")
             raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")

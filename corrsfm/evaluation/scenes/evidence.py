@@ -12,7 +12,7 @@ from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.views import Views
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index
-from corrsfm.workspace.models import are_changed
+from corrsfm.workspace.models import changed_models
 from corrsfm.workspace.stores import features_of
 
 __all__ = ["ModelEvidence", "common_evidence", "evidence_of"]
@@ -47,7 +47,7 @@ def evidence_of(workspace: Workspace, views: Views) -> ModelEvidence:
         Of its largest model.
     """
     try:
-        if are_changed(workspace):
+        if changed_models(workspace):
             raise ValueError("is of models that were changed since")
         record = read_json(workspace.evidence)
         return ModelEvidence(
