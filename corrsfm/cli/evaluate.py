@@ -52,7 +52,7 @@ def _device(run: RunConfig) -> str:
     return find_device(run.device)
 
 
-def _method_bar(name: str, total: int) -> Callable[[int], None]:
+def _filter_bar(name: str, total: int) -> Callable[[int], None]:
     from tqdm import tqdm
 
     bar = tqdm(total=total, desc=name, unit="pair")
@@ -117,7 +117,7 @@ def pose(
         threads=run.threads,
         overwrite=overwrite,
         command=command_line(),
-        on_method=_method_bar,
+        on_filter=_filter_bar,
     )
     _show({"kind": "pose", **values}, as_json)
 

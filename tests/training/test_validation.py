@@ -27,11 +27,11 @@ def validation(tmp_path_factory: pytest.TempPathFactory) -> Validation:
 
 def test_errors_are_those_of_the_evaluation(validation: Validation) -> None:
     assert len(validation.pairs) == 6
-    baseline = score_pairs(parse_method("ratio0.8+mutual/poselib"), validation.pairs)
+    (baseline,) = score_pairs([parse_method("ratio0.8+mutual/poselib")], validation.pairs)
     assert validation.baseline["errors"] == list(baseline.pose_error_deg)
     inliers = [pair.inliers().astype(np.float32) for pair in validation.pairs]
     judged = validation.judge(inliers, lambda score: score > 0.5)
-    oracle = score_pairs(parse_method("oracle/poselib"), validation.pairs)
+    (oracle,) = score_pairs([parse_method("oracle/poselib")], validation.pairs)
     assert judged["errors"] == list(oracle.pose_error_deg)
     assert (judged["precision"], judged["recall"], judged["f"]) == (100.0, 100.0, 100.0)
     assert list(judged["by_scene"]) == ["a", "b"]

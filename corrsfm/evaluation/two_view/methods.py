@@ -92,9 +92,18 @@ class TwoViewMethod:
         list of MethodOutput
             In the order of the pairs; each has an equal share of the filter's time.
         """
+        return self.estimate(pairs, *self.keep(pairs), seed=seed)
+
+    def keep(self, pairs: Sequence[OANetPair]) -> tuple[list[PruneResult], float]:
+        """Filter all pairs together, and the filter's seconds a pair."""
         start = time.perf_counter()
         results = self.filter(pairs)
-        filter_seconds = (time.perf_counter() - start) / max(len(pairs), 1)
+        return results, (time.perf_counter() - start) / max(len(pairs), 1)
+
+    def estimate(
+        self, pairs: Sequence[OANetPair], results: Sequence[PruneResult], filter_seconds: float, *, seed: int
+    ) -> list[MethodOutput]:
+        """Estimate the pose of each pair from what the filter, perhaps that of another method, kept."""
         outputs = []
         for pair, result in zip(pairs, results, strict=True):
             start = time.perf_counter()

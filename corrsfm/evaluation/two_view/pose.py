@@ -133,32 +133,35 @@ def _score_one(pair: OANetPair, output: MethodOutput) -> dict[str, float]:
 
 
 def score_pairs(
-    method: TwoViewMethod,
+    methods: Sequence[TwoViewMethod],
     pairs: Sequence[OANetPair],
     *,
     seed: int = 0,
     on_progress: Callable[[int], None] = lambda count: None,
-) -> PairScores:
-    """Run a method over labelled pairs and score each.
+) -> list[PairScores]:
+    """Run methods that share a filter over labelled pairs and score each pair.
 
     Parameters
     ----------
-    method : TwoViewMethod
+    methods : sequence of TwoViewMethod
+        Of one filter, which runs once for all of them.
     pairs : sequence of OANetPair
     seed : int
     on_progress : callable
         Called with the number of pairs just done.
     """
     # Libraries load and compile on first use, which is not the method's time.
-    method(pairs[:1], seed=seed)
-    rows: list[dict[str, float]] = []
+    for method in methods:
+        method(pairs[:1], seed=seed)
+    rows: list[list[dict[str, float]]] = [[] for _ in methods]
     for start in range(0, len(pairs), _BATCH):
         batch = pairs[start : start + _BATCH]
-        rows.extend(
-            _score_one(pair, output) for pair, output in zip(batch, method(batch, seed=seed), strict=True)
-        )
+        kept = methods[0].keep(batch)
+        for method, own in zip(methods, rows, strict=True):
+            outputs = method.estimate(batch, *kept, seed=seed)
+            own.extend(_score_one(pair, output) for pair, output in zip(batch, outputs, strict=True))
         on_progress(len(batch))
-    return PairScores(**{name: np.array([row[name] for row in rows]) for name in _PER_PAIR})
+    return [PairScores(**{name: np.array([row[name] for row in own]) for name in _PER_PAIR}) for own in rows]
 
 
 def summarise(
@@ -263,7 +266,7 @@ def evaluate_pose(
     threads: int = 0,
     overwrite: bool = False,
     command: str = "",
-    on_method: Callable[[str, int], Callable[[int], None]] = lambda name, total: lambda count: None,
+    on_filter: Callable[[str, int], Callable[[int], None]] = lambda name, total: lambda count: None,
 ) -> dict[str, Any]:
     """Measure methods on a file of labelled pairs.
 
@@ -288,8 +291,8 @@ def evaluate_pose(
         Measure again what the result file holds.
     command : str
         Recorded in the result file.
-    on_method : callable
-        Called with a method's name and the number of pairs when it starts; what it returns is called with
+    on_filter : callable
+        Called with a filter's name and the number of pairs when it starts; what it returns is called with
         the number of pairs done.
 
     Returns
@@ -305,19 +308,24 @@ def evaluate_pose(
     subject = _load_subject(path, max_per_scene, seed)
     old = kept_methods(results, "pose", subject.description, overwrite=overwrite)
     entries: dict[str, Any] = dict(old)
+    groups: dict[str, list[TwoViewMethod]] = {}
     for method in built:
         if not (method.name in old and old[method.name]["fingerprint"] == method.fingerprint):
-            progress = on_method(method.name, len(subject.pairs))
-            scores = score_pairs(method, subject.pairs, seed=seed, on_progress=progress)
+            groups.setdefault(method.filter.fingerprint, []).append(method)
+    for group in groups.values():
+        progress = on_filter(group[0].filter.name, len(subject.pairs))
+        for method, scores in zip(
+            group, score_pairs(group, subject.pairs, seed=seed, on_progress=progress), strict=True
+        ):
             entries[method.name] = {
                 "fingerprint": method.fingerprint,
                 "measured": provenance(seed=seed, command=command, device=device),
                 "pairs": _to_json(scores),
             }
-            if results is not None:
-                # After every method, so that a long run can be stopped and resumed.
-                known = baseline if baseline in entries else None
-                _write(results, subject, entries, known, seed, command, device)
+        if results is not None:
+            # After every filter, so that a long run can be stopped and resumed.
+            known = baseline if baseline in entries else None
+            _write(results, subject, entries, known, seed, command, device)
     return _write(results, subject, entries, baseline, seed, command, device)
 
 

@@ -44,7 +44,7 @@ def _scores(errors: list[float], kept: float = 1.0) -> PairScores:
 
 def test_scores_of_the_oracle_are_perfect_and_empty_pairs_fail():
     pairs = [make_pair(seed=i, num=200, inlier_ratio=0.4) for i in range(3)] + [make_pair(seed=7, num=0)]
-    scores = score_pairs(parse_method("oracle/poselib"), pairs)
+    (scores,) = score_pairs([parse_method("oracle/poselib")], pairs)
     assert scores.precision.tolist() == [100, 100, 100, 0]
     assert scores.recall.tolist() == [100, 100, 100, 0]
     assert scores.pose_error_deg[:3].max() < 0.5
@@ -54,8 +54,8 @@ def test_scores_of_the_oracle_are_perfect_and_empty_pairs_fail():
 
 def test_scores_do_not_depend_on_the_batch():
     pairs = [make_pair(seed=i, num=60 + i) for i in range(11)]
-    together = score_pairs(parse_method("ratio0.8/poselib"), pairs)
-    alone = score_pairs(parse_method("ratio0.8/poselib"), pairs[9:10])
+    (together,) = score_pairs([parse_method("ratio0.8/poselib")], pairs)
+    (alone,) = score_pairs([parse_method("ratio0.8/poselib")], pairs[9:10])
     assert together.pose_error_deg[9] == alone.pose_error_deg[0]
 
 
@@ -110,13 +110,29 @@ def test_second_run_measures_only_what_is_new(pairs_file: Path, tmp_path: Path):
         ["mutual/poselib", "ratio0.8/poselib"],
         results=results,
         baseline="ratio0.8/poselib",
-        on_method=note,
+        on_filter=note,
     )
-    assert measured == ["ratio0.8/poselib"]
+    assert measured == ["ratio0.8"]
     assert second["methods"]["mutual/poselib"]["pairs"] == first["methods"]["mutual/poselib"]["pairs"]
     assert set(second["methods"]["mutual/poselib"]["summary"]["auc_minus_baseline"]) == {"5", "10", "20"}
-    evaluate_pose(pairs_file, ["mutual/poselib"], results=results, overwrite=True, on_method=note)
-    assert measured == ["ratio0.8/poselib", "mutual/poselib"]
+    evaluate_pose(pairs_file, ["mutual/poselib"], results=results, overwrite=True, on_filter=note)
+    assert measured == ["ratio0.8", "mutual"]
+
+
+def test_estimators_share_one_run_of_their_filter(pairs_file: Path):
+    names = ["mutual/poselib", "ratio0.8/poselib", "mutual/ransac"]
+    measured: list[str] = []
+
+    def note(name: str, total: int):
+        measured.append(name)
+        return lambda count: None
+
+    together = evaluate_pose(pairs_file, names, on_filter=note)["methods"]
+    assert measured == ["mutual", "ratio0.8"]
+    for name in names:
+        alone = evaluate_pose(pairs_file, [name])["methods"][name]
+        for key in ("rotation_error_deg", "translation_error_deg", "num_kept"):
+            assert together[name]["pairs"][key] == alone["pairs"][key]
 
 
 def test_results_of_other_pairs_are_not_mixed(pairs_file: Path, tmp_path: Path):
