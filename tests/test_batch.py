@@ -219,6 +219,16 @@ def test_words_that_no_run_would_take_are_refused_before_any_scene(
     assert not output.exists()
 
 
+def test_a_pipeline_that_no_run_would_take_is_refused_before_any_scene(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text("[prune]\nmethod = 7\n")
+    photos, output = collection(tmp_path, "a"), tmp_path / "out"
+    for name in ("mine.toml", "none.toml"):
+        words = ["batch", str(photos), str(output), "--pipeline", str(tmp_path / name)]
+        result = CliRunner().invoke(main, words)
+        assert result.exit_code == 1 and f"{tmp_path / name}: " in result.stderr
+    assert not output.exists()
+
+
 def test_a_scene_that_was_killed_is_told_from_one_that_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -56,11 +56,15 @@ def batch(
 def _check_arguments(run_arguments: tuple[str, ...]) -> None:
     """Refuse once what `corrsfm run` would refuse for every scene, and words that it takes for folders."""
     from corrsfm.cli.stages import run
+    from corrsfm.config import load_pipeline
 
     folders = ["PHOTOS", "WORKSPACE"]
     with run.make_context("corrsfm run", [*folders, *run_arguments]) as context:
         given = [str(path) for path in (*context.params["photos"], context.params["workspace_dir"])]
+        pipeline = context.params["file"]
     if stray := given[len(folders) :]:
         raise click.UsageError(
             f"{first_few(stray)}: expected options of corrsfm run after the collection and the output"
         )
+    if pipeline:
+        load_pipeline(pipeline)
