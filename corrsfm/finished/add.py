@@ -12,7 +12,7 @@ import dataclasses
 import logging
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,7 +49,7 @@ from corrsfm.pairs.stage import fingerprint_of as pairs_fingerprint
 from corrsfm.pairs.strategies import pairs_of_new_photos
 from corrsfm.pipeline import check_options
 from corrsfm.prune.stage import prune_matches
-from corrsfm.report.stage import report
+from corrsfm.report.stage import report, summarise
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import Camera, Pair, PairList
 from corrsfm.workspace import Workspace
@@ -98,7 +98,7 @@ class AddResult:
     Attributes
     ----------
     photos : tuple of AddedPhoto
-        The new photos, sorted by name.
+        The new photos, sorted by name; of photos that were there already, those that are in no model.
     already_there : tuple of str
         Photos that the scene holds with the same bytes; nothing was done for them.
     num_new_pairs : int
@@ -172,7 +172,9 @@ def add_photos(
                 raise InputError(
                     f"{scene.root}: no photos to add were named; try: corrsfm add {scene.root} NEW"
                 )
-            return AddResult(photos=(), already_there=already)
+            summary, _ = summarise(scene)
+            unregistered = {photo.name for photo in summary.missing}.intersection(already)
+            return AddResult(photos=_outcomes(unregistered, scene, summary), already_there=already)
         require_folder(scene, incoming, wanted)
         require_readable(incoming)
         pending = dataclasses.replace(pending, photos=wanted, refine=refine or pending.refine)
@@ -228,7 +230,7 @@ class _Addition:
         summary = report(workspace, html=True)
         workspace.adding.unlink(missing_ok=True)
         return AddResult(
-            photos=self._outcomes(summary),
+            photos=_outcomes(self._new, workspace, summary),
             already_there=already,
             num_new_pairs=matched.num_items - matched.num_reused,
             num_new_points=num_new_points,
@@ -407,26 +409,27 @@ class _Addition:
         self._say(outcome)
         return num_new_points
 
-    def _outcomes(self, summary: SceneReport) -> tuple[AddedPhoto, ...]:
-        """What became of each photo, with a reason and a next step where it joined no model."""
-        added = read_added(self._workspace)
-        missing = {photo.name: photo for photo in summary.missing}
-        outcomes = []
-        for name in self._new:
-            entry = added.get(name, {})
-            lost = entry.get("model") is None and name in missing
-            reason = ""
-            if lost:
-                photo = missing[name]
-                reason = entry.get("why_not") or f"{photo.reason}: {photo.detail}"
-            outcomes.append(
-                AddedPhoto(
-                    name=name,
-                    model=entry.get("model"),
-                    num_inliers=entry.get("num_inliers", 0),
-                    median_error_px=entry.get("median_error_px"),
-                    reason=reason,
-                    next_step=next_step(missing[name], self._workspace) if lost else "",
-                )
+
+def _outcomes(names: Collection[str], workspace: Workspace, summary: SceneReport) -> tuple[AddedPhoto, ...]:
+    """What became of each photo, with a reason and a next step where it joined no model."""
+    added = read_added(workspace)
+    missing = {photo.name: photo for photo in summary.missing}
+    outcomes = []
+    for name in sorted(names):
+        entry = added.get(name, {})
+        lost = entry.get("model") is None and name in missing
+        reason = ""
+        if lost:
+            photo = missing[name]
+            reason = entry.get("why_not") or f"{photo.reason}: {photo.detail}"
+        outcomes.append(
+            AddedPhoto(
+                name=name,
+                model=entry.get("model"),
+                num_inliers=entry.get("num_inliers", 0),
+                median_error_px=entry.get("median_error_px"),
+                reason=reason,
+                next_step=next_step(missing[name], workspace) if lost else "",
             )
-        return tuple(outcomes)
+        )
+    return tuple(outcomes)

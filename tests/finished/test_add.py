@@ -296,6 +296,8 @@ def test_a_photo_of_elsewhere_is_named_with_a_reason_and_a_next_step(
     assert result.report is not None
     assert [missing.name for missing in result.report.missing] == ["noise.png"]
     assert raw(scene.model()) == raw(made.model())
+    again = add_photos(scene.workspace, tmp_path / "noise.png", run=RUN)
+    assert again.already_there == ("noise.png",) and again.photos == result.photos
 
 
 def test_photos_that_are_there_already_are_nothing_to_do(scene: SceneToGrow) -> None:
