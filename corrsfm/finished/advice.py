@@ -33,7 +33,7 @@ def next_step(missing: MissingPhoto, workspace: Workspace) -> str:
     """What to try for a photo that is not in the first model."""
     match missing.reason:
         case MissingReason.LEFT_OUT:
-            return f"replace the file, then: {workspace.command_for('features')}"
+            return f"replace the file, then: {workspace.remedy_for('features')}"
         case MissingReason.NO_PAIR:
             return command_again(workspace, "pairs", "--pairing", "exhaustive")
         case MissingReason.NO_MATCH:

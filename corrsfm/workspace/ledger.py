@@ -140,16 +140,16 @@ class Ledger(Layout):
             why = shlex.join(["corrsfm", "report", str(self.root)])
             raise WorkspaceError(f"{self.root}: mapping gave no model; why: {why}")
         if record is None:
-            raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self._remedy(stage)}")
+            raise WorkspaceError(f"{self.root}: no {label_of(stage)} yet; run: {self.remedy_for(stage)}")
         for name, fingerprint in record.inputs.items():
             if self.require(name).fingerprint != fingerprint:
                 raise WorkspaceError(
                     f"{self.root}: {label_of(stage)} are older than {label_of(name)};"
-                    f" run: {self._remedy(stage)}"
+                    f" run: {self.remedy_for(stage)}"
                 )
         return record
 
-    def _remedy(self, stage: str) -> str:
+    def remedy_for(self, stage: str) -> str:
         """The command that makes a stage current; an addition that was interrupted is finished first."""
         if self.adding.exists():
             return shlex.join(["corrsfm", "add", str(self.root)])

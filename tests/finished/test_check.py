@@ -12,7 +12,9 @@ from scene_to_grow import contents
 import corrsfm.finished.check as checking
 from corrsfm.cli import main
 from corrsfm.errors import WorkspaceError
+from corrsfm.finished.advice import next_step
 from corrsfm.finished.check import check_workspace
+from corrsfm.report.missing import MissingPhoto, MissingReason
 from corrsfm.report.stage import summarise
 from corrsfm.report.statistics import SceneReport, make_report
 from corrsfm.types import ModelSummary, PairStatistics
@@ -65,6 +67,14 @@ def test_a_missing_photo_is_named_with_its_reason_and_a_command(scene: FinishedS
     (finding,) = [one for one in result.findings if one.kind in ("missing", "parts")]
     assert LEFT_OUT in finding.text or LEFT_OUT in finding.photos
     assert "corrsfm" in finding.next_step and str(scene.workspace) in finding.next_step
+
+
+def test_a_photo_that_cannot_be_read_goes_on_with_the_command_that_brought_it(scene: FinishedScene) -> None:
+    workspace = Workspace(scene.workspace)
+    photo = MissingPhoto(name="cut.jpg", reason=MissingReason.LEFT_OUT, detail="cannot be read", next_step="")
+    assert next_step(photo, workspace).startswith("replace the file, then: corrsfm extract ")
+    workspace.adding.write_text("{}")
+    assert next_step(photo, workspace) == f"replace the file, then: corrsfm add {scene.workspace}"
 
 
 def test_photos_that_changed_or_went_away_are_named(scene: FinishedScene) -> None:
