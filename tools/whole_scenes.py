@@ -102,6 +102,15 @@ SETTINGS: list[Plain | Corrsfm] = [
             ("LightGlue", "lightglue", ("none",)),
         )
     ),
+    *(
+        # NAME_VARIANT.pt holds a network NAME that `tools/rivals.sh` trained.
+        Corrsfm(
+            name=f"rival {weights.stem}",
+            column=weights.stem,
+            prune=("--method", weights.stem.partition("_")[0], "--model", str(weights)),
+        )
+        for weights in sorted((TOOLS.parent / "results" / "rivals").glob("*.pt"))
+    ),
 ]
 
 
