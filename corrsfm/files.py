@@ -22,6 +22,8 @@ from corrsfm.errors import InputError, WorkspaceError
 __all__ = [
     "FRAME_TIMES",
     "OWN_RECORD",
+    "PAGE_BEGINNING",
+    "RESULT_BEGINNING",
     "atomic_path",
     "atomic_write_json",
     "atomic_write_text",
@@ -31,6 +33,7 @@ __all__ = [
     "read_json",
     "read_lines",
     "read_text",
+    "remove",
     "replaced_name",
     "require_file",
     "require_replaceable",
@@ -45,6 +48,15 @@ OWN_RECORD = ".corrsfm.json"
 
 FRAME_TIMES = "frames.json"
 """The file beside the frames of a video that lists them in the order of time."""
+
+PAGE_BEGINNING = (
+    b'<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+    b'<meta http-equiv="Content-Security-Policy"'
+)
+"""How every page that corrsfm writes begins."""
+
+RESULT_BEGINNING = b'{\n "format_version"'
+"""How every result file begins."""
 
 LARGEST_TEXT_BYTES = 1 << 28
 """Of a list that is read at once: two million pairs of long names."""
@@ -84,7 +96,7 @@ def atomic_path(path: Path, *, before_replacing: Callable[[], None] = lambda: No
                 f"{path}: cannot be replaced ({error.strerror}); choose another name"
             ) from error
     finally:
-        _remove(temporary)
+        remove(temporary)
 
 
 def _unfinished(path: Path) -> Path:
@@ -94,7 +106,7 @@ def _unfinished(path: Path) -> Path:
     temporary = unfinished_name(path)
     try:
         make_folder(path.parent)
-        _remove(temporary)
+        remove(temporary)
     except OSError as error:
         advice = "" if is_of_the_disk(error) else "; choose another place"
         raise WorkspaceError(why_not(error, path, "written") + advice) from error
@@ -129,7 +141,8 @@ def _sync_below(folder: Path) -> None:
         sync_folder(Path(root))
 
 
-def _remove(path: Path) -> None:
+def remove(path: Path) -> None:
+    """Remove a file, a link or a folder with all in it, if it is there."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -144,14 +157,14 @@ def replaced_name(folder: Path) -> Path:
 def _replace_folder(source: Path, target: Path, before_replacing: Callable[[], None]) -> None:
     """Put a folder in another's place; a kill in between leaves neither, never a mixture."""
     old = replaced_name(target)
-    _remove(old)
+    remove(old)
     _sync_below(source)
     before_replacing()
     if target.exists():
         os.replace(target, old)
     os.replace(source, target)
     sync_folder(target.parent)
-    _remove(old)
+    remove(old)
 
 
 def atomic_write_text(path: Path, text: str) -> None:

@@ -27,6 +27,7 @@ from corrsfm.machine import count_threads, find_device, versions
 from corrsfm.matches.stage import match_pairs
 from corrsfm.model.lightglue import load_package
 from corrsfm.pairs.stage import make_pairs
+from corrsfm.pairs.strategies import check_files
 from corrsfm.prune import build_pruner, checkpoint_sha256
 from corrsfm.prune.stage import prune_matches
 from corrsfm.reconstruction.stage import reconstruct
@@ -94,7 +95,7 @@ def run_scene(
     with contextlib.ExitStack() as stack:
         with collect_warnings() as met:
             check_options(
-                run, config.prune, features=config.features, matches=config.matches,
+                run, config.prune, features=config.features, pairs=config.pairs, matches=config.matches,
                 workspace_dir=workspace_dir,
             )  # fmt: skip
             stack.enter_context(connected(run.cluster, run.workers))
@@ -145,10 +146,11 @@ def check_options(
     prune: cfg.PruneConfig | None = None,
     *,
     features: cfg.FeaturesConfig | None = None,
+    pairs: cfg.PairsConfig | None = None,
     matches: cfg.MatchesConfig | None = None,
     workspace_dir: Path | None = None,
 ) -> None:
-    """Check the device, the networks and whether the stages fit each other, before any work is done.
+    """Check the device, networks and files, and whether the stages fit each other, before any work is done.
 
     Parameters
     ----------
@@ -156,6 +158,7 @@ def check_options(
     prune : PruneConfig, optional
         The method that comes later; none if matching is the last stage.
     features : FeaturesConfig, optional
+    pairs : PairsConfig, optional
     matches : MatchesConfig, optional
     workspace_dir : Path, optional
         Imported features and matches in it are kept; it need not exist.
@@ -166,12 +169,16 @@ def check_options(
         If there is no such device, or an option does not fit the features.
     DependencyError
         If a network is not installed.
+    InputError
+        If a file that pairs are to come from is missing.
     CheckpointError
         If the method needs a checkpoint and it is missing, cannot be read or does not fit the features.
     WorkspaceError
         If the folder holds features or matches of another tool.
     """
     device = find_device(run.device)
+    if pairs is not None:
+        check_files(pairs)
     features, matches = features or cfg.FeaturesConfig(), matches or cfg.MatchesConfig()
     known = None
     if workspace_dir is not None:

@@ -22,7 +22,7 @@ from corrsfm.config.fields import flag_of
 from corrsfm.disk import is_closed, opening
 from corrsfm.errors import InputError, printable
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
-from corrsfm.files import require_replaceable, why_unusable
+from corrsfm.files import RESULT_BEGINNING, require_replaceable, why_unusable
 
 __all__ = [
     "OVERWRITE_KEY",
@@ -85,7 +85,7 @@ CHECKPOINT_FILE = _OutputType("a checkpoint", b"PK")
 CSV_FILE = _OutputType("a table of poses", b"name,")
 PAIR_FILE = _OutputType("a file of labelled pairs", b"\x89HDF")
 PNG_FILE = _OutputType("a PNG", b"\x89PNG")
-RESULT_FILE = _OutputType("a result file", b'{\n "format_version"')
+RESULT_FILE = _OutputType("a result file", RESULT_BEGINNING)
 
 
 F = typing.TypeVar("F", bound=Callable[..., Any])

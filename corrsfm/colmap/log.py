@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from corrsfm.files import make_folder, unfinished_name
+from corrsfm.files import make_folder, remove, unfinished_name
 
 __all__ = ["colmap_log", "pycolmap_version"]
 
@@ -65,9 +65,9 @@ def colmap_log(log_file: Path | None = None) -> Iterator[None]:
 def _folder_beside(log_file: Path) -> Iterator[Path]:
     """An empty folder with a name of its own, so that what a killed process left is found and removed."""
     folder = unfinished_name(log_file)
-    shutil.rmtree(folder, ignore_errors=True)
     # Ctrl-C may come as soon as it is there.
     try:
+        remove(folder)
         make_folder(folder)
         yield folder
     finally:

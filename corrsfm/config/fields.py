@@ -158,7 +158,9 @@ def _build(cls: type[T], values: dict[str, Any], prefix: str, problems: list[str
     arguments: dict[str, Any] = {}
     for key, value in values.items():
         name = key.replace("-", "_")
-        if name not in names:
+        if name in arguments:
+            problems.append(f"'{prefix}{key}' is there twice, with - and with _")
+        elif name not in names:
             problems.append(f"unknown key '{prefix}{key}', valid are {', '.join(names)}")
         elif dataclasses.is_dataclass(annotations[name]):
             if isinstance(value, dict):

@@ -344,7 +344,7 @@ class ReconstructionConfig:
         "Try to join several models; a joined one is kept if enough points agree on how its parts lie to "
         "each other, and it explains and predicts what they did",
     )
-    min_model_size: int = option(3, "Smallest model worth keeping", unit="photos", minimum=2)
+    min_model_size: int = option(3, "Smallest model worth keeping beside the first", unit="photos", minimum=2)
     multiple_models: bool = option(True, "Keep several models when the photos do not connect")
     refine_intrinsics: bool = option(
         True,

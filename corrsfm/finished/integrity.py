@@ -16,6 +16,7 @@ from corrsfm.types import Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.items import K, T
 from corrsfm.workspace.lists import read_index, read_pairs
+from corrsfm.workspace.models import what_mapping_again_moves
 from corrsfm.workspace.store import ItemStore
 from corrsfm.workspace.stores import features_of, matches_of, pruned_of
 
@@ -78,19 +79,30 @@ def find_damage(workspace: Workspace) -> list[Damage]:
             remedy = shlex.join(["corrsfm", "add", str(workspace.root)])
         elif changed == [workspace.added]:
             problem += "; what it says of added photos is lost, the models are not"
-            removal = shlex.join(["rm", "-rf", str(workspace.added)])
-            remedy = f"{removal}; {shlex.join(['corrsfm', 'report', str(workspace.root)])}"
+            remedy = _report_without(workspace.added, workspace)
+        elif changed == [workspace.evidence] and workspace.added.exists():
+            problem += "; the verdict is lost, the models are not"
+            remedy = _report_without(workspace.evidence, workspace)
         elif stage in _STORES and path.exists():
             remedy = command_again(workspace, stage, "--verify")
         elif stage == "models":
-            # Models that photos were added to cannot be made again; it keeps a copy of them.
+            problem += what_mapping_again_moves(workspace)
             remedy = command_again(workspace, stage, "--overwrite")
         else:
             remedy = command_again(workspace, stage)
+            if stage == "verified matches":
+                problem += what_mapping_again_moves(workspace)
             if path.exists():
                 remedy = f"{shlex.join(['rm', '-r', str(path)])}; {remedy}"
         found.append(Damage(path=path, problem=problem, remedy=remedy))
     return [*found, *_changed_records(workspace)]
+
+
+def _report_without(lost: Path, workspace: Workspace) -> str:
+    """The commands that take the loss of a file for granted."""
+    return "; ".join(
+        [shlex.join(["rm", "-rf", str(lost)]), shlex.join(["corrsfm", "report", str(workspace.root)])]
+    )
 
 
 def _put_in_place(path: Path) -> str:

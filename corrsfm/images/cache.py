@@ -60,8 +60,10 @@ class PhotoCache:
             return compute(path)
         name = str(path.resolve())
         stamp = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
-        known = self._known.get(name)
-        entry = self._kept.setdefault(name, known if known and known["stamp"] == stamp else {"stamp": stamp})
+        entry = self._kept.get(name) or self._known.get(name)
+        if entry is None or entry["stamp"] != stamp:
+            entry = {"stamp": stamp}
+        self._kept[name] = entry
         if key not in entry:
             entry[key] = compute(path)
         return entry[key]

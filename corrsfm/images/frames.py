@@ -117,7 +117,7 @@ def extract_frames(
     if len(frames) < 2:
         raise InputError(
             f"{video}: {num} frames can be decoded, in which the picture moves by {measured.path[-1]:.0%} of "
-            "its width: fewer than two frames to reconstruct from; film while you walk, or try --every 0.1s"
+            f"its width: fewer than two frames to reconstruct from; {_more_frames(num_frames, every)}"
         )
     try:
         _write(video, folder, frames, {"frames": num_frames, "every": every}, hash_of, track)
@@ -140,6 +140,13 @@ def extract_frames(
         measured.times_s[-1] - measured.times_s[0],
     )
     return frames
+
+
+def _more_frames(num_frames: int, every: str) -> str:
+    """What to try where fewer than two frames were chosen."""
+    if num_frames == 1:
+        return "ask for more than --frames 1"
+    return f"film while you walk, or try {f'less than --every {every}' if every else '--every 0.1s'}"
 
 
 def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: Track) -> Measured:

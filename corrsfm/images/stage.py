@@ -175,7 +175,8 @@ def _refuse_vanished_photos(workspace: Workspace, source: PhotoSource) -> None:
         known = read_index(workspace).names
     except WorkspaceError:
         return
-    if source.video is not None and source.given == workspace.given_photos:
+    # A workspace that lost its record knows no video; its frames say which they are from.
+    if source.video is not None and workspace.given_photos in ((), source.given):
         return
     gone = [name for name in known if not any(map(os.path.exists, possible_originals(source.folder / name)))]
     if 2 * len(gone) > len(known):

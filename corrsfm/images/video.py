@@ -28,6 +28,7 @@ _MOVING_SHARE = 0.8
 # Motion in widths of the frame. Below the first the camera counts as standing: hands tremble.
 _STANDING = 0.01
 _NEW_REFERENCE = 0.04
+_SHORTEST_STRETCH_S = 1e-3
 # Without options: a frame for every fortieth of the width that the picture moves, but not too many.
 _SPACING = 0.025
 _MOST_FRAMES = 300
@@ -82,8 +83,8 @@ def seconds_of(text: str) -> float:
         seconds = float(number) * factor
     except ValueError:
         seconds = float("nan")
-    if not (np.isfinite(seconds) and seconds > 0):
-        raise ConfigError(f"every is '{text}', expected a time such as 0.5s or 500ms")
+    if not (np.isfinite(seconds) and seconds >= _SHORTEST_STRETCH_S):
+        raise ConfigError(f"every is '{text}', expected a time from 1ms on, such as 0.5s or 500ms")
     return seconds
 
 
@@ -97,7 +98,7 @@ def _open(path: Path) -> cv2.VideoCapture:
             raise InputError(f"{path}: is a list of other files, expected a video")
     # FFmpeg and OpenCV report what is wrong with a video by themselves, line upon line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     cv2.utils.logging.setLogLevel(level)
     if not capture.isOpened():

@@ -126,6 +126,26 @@ def make_pairs(
     return _merged(names, proposals)
 
 
+def check_files(config: PairsConfig) -> None:
+    """Check that the files of the strategies are named and there, before any work is done.
+
+    Raises
+    ------
+    ConfigError
+        If an option that a strategy needs is missing.
+    InputError
+        If there is no such file.
+    """
+    for strategy, path, flag in (
+        (PairStrategy.FILE, config.pairs_file, "--pairs-file"),
+        (PairStrategy.COVISIBILITY, config.covisible_model, "--covisible-model"),
+    ):
+        if strategy in config.pairing:
+            _needed(path, flag, strategy)
+        if path is not None and not path.exists():
+            raise InputError(f"{path}: no such file; expected what {flag} names")
+
+
 def num_pairs_expected(num_photos: int, config: PairsConfig) -> int:
     """Pairs that ``auto`` makes of photos; an upper bound where they are chosen by similarity."""
     every = num_photos * (num_photos - 1) // 2

@@ -20,7 +20,7 @@ from corrsfm.colmap.pairs import names_of_verified_pairs, read_verified_matches
 from corrsfm.config import config_hash
 from corrsfm.disk import is_closed, opening
 from corrsfm.errors import CorrsfmError, InputError, ReconstructionError, first_few
-from corrsfm.files import atomic_write_json
+from corrsfm.files import atomic_write_json, remove
 from corrsfm.graph import connected_components
 from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
@@ -202,7 +202,7 @@ class _Choice:
         # Drop candidates that were mapped from other matches or options.
         for folder in workspace.candidates.glob("*"):
             if folder != self._workdir:
-                shutil.rmtree(folder)
+                remove(folder)
         try:
             selection = select_model(
                 first,

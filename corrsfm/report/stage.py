@@ -43,6 +43,9 @@ def report(workspace: Workspace, *, html: bool = False) -> SceneReport:
         summary, models = summarise(workspace)
     if not workspace.added.exists():
         workspace.forget_file("models", workspace.added)
+    elif not workspace.evidence.exists():
+        # Models that photos were added to cannot be mapped again to be judged.
+        workspace.forget_file("models", workspace.evidence)
     kept = read_warnings(workspace.warnings_json)
     stages = (BEFORE_STAGES, *STAGE_COMMANDS)
     said = [*((stage, kept.get(stage, [])) for stage in stages), ("report", met)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import html
 
+from corrsfm.files import PAGE_BEGINNING
+
 __all__ = ["frame", "section"]
 
 # Nothing is loaded from elsewhere; plotly compiles code at run time.
@@ -115,8 +117,7 @@ def frame(title: str, subtitle: str, body: str) -> str:
         HTML.
     """
     return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
+        f'{PAGE_BEGINNING.decode()} content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(title)} · corrsfm</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n"
         f"<header><h1>{html.escape(title)}</h1><p>{subtitle}</p></header>\n<main>\n{body}\n</main>\n"

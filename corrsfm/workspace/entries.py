@@ -41,7 +41,8 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
     with os.scandir(root) as entries:
         for entry in entries:
             # Beside a database, SQLite keeps its log.
-            if own and entry.name.rpartition("-")[0] not in own and entry.name not in own:
+            of_database = entry.name if entry.name.endswith(".db") else entry.name.rpartition("-")[0]
+            if own and of_database not in own and entry.name not in own:
                 continue
             mode = entry.stat(follow_symlinks=False).st_mode
             if stat.S_ISLNK(mode) and not may_link:
@@ -50,7 +51,8 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
                     f"its place, or run: {_removal(entry.path)}"
                 )
             expected = "file" if Path(entry.name).suffix else "folder"
-            if entry.name in own and not stat.S_ISLNK(mode) and stat.S_ISDIR(mode) != (expected == "folder"):
+            is_ours = entry.name in own or of_database.endswith(".db")
+            if is_ours and not stat.S_ISLNK(mode) and stat.S_ISDIR(mode) != (expected == "folder"):
                 raise WorkspaceError(
                     f"{entry.path}: is in the place of a {expected} of the workspace; move it away, or run: "
                     f"{_removal(entry.path)}"

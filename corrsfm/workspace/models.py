@@ -19,7 +19,7 @@ from corrsfm.workspace.lists import read_index
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["changed_models", "copy_aside", "models_of", "others_in_models"]
+__all__ = ["changed_models", "copy_aside", "models_of", "others_in_models", "what_mapping_again_moves"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -63,6 +63,13 @@ def changed_models(workspace: Workspace, changed: Iterable[Path] | None = None) 
     return sorted({workspace.sparse / path.parts[0] for path in inside})
 
 
+def what_mapping_again_moves(workspace: Workspace) -> str:
+    """To append to advice to map again: models that photos were added to do not come out as they were."""
+    if not workspace.added.exists():
+        return ""
+    return "; photos were added to the models: mapped again every pose moves, and a copy of them is kept"
+
+
 def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> list[pycolmap.Reconstruction]:
     """The reconstructed models, the largest first.
 
@@ -82,7 +89,10 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
     for folder in changed_models(workspace, changed):
         if not _can_be_read(folder):
             remedy = workspace.command_for("models", "--overwrite")
-            raise WorkspaceError(f"{folder}: damaged, not as it was written; make it again with: {remedy}")
+            raise WorkspaceError(
+                f"{folder}: damaged, not as it was written"
+                f"{what_mapping_again_moves(workspace)}; make it again with: {remedy}"
+            )
         logger.warning(
             "%s: changed since corrsfm wrote it; it is used as it is, without the verdict on the old "
             "one; for a new one: %s",

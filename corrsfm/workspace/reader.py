@@ -198,7 +198,7 @@ class ItemReader(ABC, Generic[K, T]):
         """
         damaged = []
         with self._reading(sealed=False) as connection, self._errors():
-            (problem,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            (problem,) = connection.execute("PRAGMA integrity_check(1)").fetchone()
             if problem != "ok":
                 raise sqlite3.DatabaseError(problem)
             orphans = "SELECT key FROM items WHERE number NOT IN (SELECT number FROM arrays)"

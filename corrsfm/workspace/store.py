@@ -163,7 +163,7 @@ class ItemStore(ItemReader[K, T]):
             return
         try:
             with self._errors():
-                (problem,) = self._writer().execute("PRAGMA quick_check(1)").fetchone()
+                (problem,) = self._writer().execute("PRAGMA integrity_check(1)").fetchone()
             if problem != "ok":
                 raise self._damaged(problem)
         except DamageError:

@@ -32,6 +32,13 @@ def test_errors_go_to_the_file_alone(tmp_path: Path, capfd: pytest.CaptureFixtur
     assert "no model" in (tmp_path / "log.txt").read_text()
 
 
+def test_whatever_has_the_name_of_an_unfinished_log_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".log.txt.corrsfm.partial").write_text("left")
+    with colmap_log(tmp_path / "log.txt"):
+        pycolmap.logging.error("no model")
+    assert [path.name for path in tmp_path.iterdir()] == ["log.txt"]
+
+
 def test_a_database_without_its_end_is_told_from_whole_ones_and_other_files(tmp_path: Path) -> None:
     path = tmp_path / "database.db"
     pycolmap.Database.open(path).close()

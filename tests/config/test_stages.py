@@ -41,7 +41,8 @@ def test_a_pipeline_file_overrides_only_what_it_names(tmp_path: Path) -> None:
 def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> None:
     path = tmp_path / "p.toml"
     path.write_text(
-        '[features]\nmax_features = 0\nsize = 1\n[prune]\nmethod = "magic"\n[colour]\n[run]\nseed = "x"\n'
+        '[features]\nmax_features = 0\nsize = 1\nmax-features = 7\n[prune]\nmethod = "magic"\n[colour]\n'
+        '[run]\nseed = "x"\n'
     )
     with pytest.raises(ConfigError) as error:
         cfg.load_pipeline(path)
@@ -49,6 +50,7 @@ def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> N
     for part in (
         str(path),
         "features.max_features is 0, expected at least 1",
+        "'features.max-features' is there twice, with - and with _",
         "unknown key 'features.size', valid are extractor, max_features",
         "prune.method is 'magic', expected one of none, ratio",
         "unknown key 'colour', valid are images, features",

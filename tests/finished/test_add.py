@@ -174,6 +174,25 @@ def test_what_an_addition_made_is_not_replaced_silently(
         assert contents(scene.workspace / "sparse") == before
 
 
+def test_the_loss_of_the_verdict_costs_no_model_that_photos_were_added_to(
+    grown: SceneToGrow, tmp_path: Path
+) -> None:
+    scene = grown.copy(tmp_path / "own")
+    workspace = Workspace(scene.workspace)
+    before = contents(workspace.sparse)
+    workspace.evidence.write_text("{")
+    (damage,) = find_damage(workspace)
+    assert damage.problem.endswith("the verdict is lost, the models are not")
+    assert damage.remedy == f"rm -rf {workspace.evidence}; corrsfm report {workspace.root}"
+    workspace.evidence.unlink()
+    report(Workspace(scene.workspace))
+    assert not find_damage(Workspace(scene.workspace))
+    assert contents(workspace.sparse) == before
+    (workspace.sparse / "0" / "points3D.bin").write_bytes(b"")
+    (damage,) = find_damage(Workspace(scene.workspace))
+    assert "mapped again every pose moves, and a copy of them is kept" in damage.problem
+
+
 @pytest.mark.parametrize("content", [None, "", '{"photos": {"a.jpg": 3}}'])
 def test_the_loss_of_what_is_known_of_added_photos_costs_no_model(
     content: str | None, grown: SceneToGrow, tmp_path: Path

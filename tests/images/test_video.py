@@ -124,9 +124,9 @@ def test_a_list_of_other_files_is_no_video(tmp_path: Path, content: str) -> None
         extract_frames(tmp_path / "video.mp4", tmp_path / "frames")
 
 
-@pytest.mark.parametrize("text", ["", "s", "fast", "0", "-1s", "nan", "inf"])
+@pytest.mark.parametrize("text", ["", "s", "fast", "0", "-1s", "nan", "inf", "1e-300s", "0.9ms"])
 def test_what_is_no_duration_is_refused(text: str) -> None:
-    with pytest.raises(ConfigError, match="expected a time such as 0.5s"):
+    with pytest.raises(ConfigError, match="expected a time from 1ms on, such as 0.5s"):
         seconds_of(text)
 
 
@@ -224,6 +224,10 @@ def test_a_video_in_which_nothing_moves_is_refused(tmp_path: Path) -> None:
     still = write_video(tmp_path / "a.avi", [next(iter(sliding(3)))] * 20)
     with pytest.raises(InputError, match=r"20 frames can be decoded, .* moves by 0% .*film while you walk"):
         extract_frames(still, tmp_path / "frames")
+    with pytest.raises(InputError, match=r"or try less than --every 5s"):
+        extract_frames(still, tmp_path / "frames", every="5s")
+    with pytest.raises(InputError, match=r"ask for more than --frames 1"):
+        extract_frames(still, tmp_path / "frames", num_frames=1)
     black = write_video(tmp_path / "b.avi", [np.zeros((SIZE[1], SIZE[0], 3), np.uint8)] * 5)
     with pytest.raises(InputError, match="fewer than two frames"):
         extract_frames(black, tmp_path / "frames_b")
@@ -315,6 +319,24 @@ def test_overwrite_makes_frames_again(workspace: Workspace, walk: Film, tmp_path
     damaged.write_bytes(b"damaged")
     pipeline.index_photos(copied, walk.path, cfg.ImagesConfig(frames=14), RUN, overwrite=True)
     assert damaged.read_bytes() == whole
+
+
+def test_frames_of_a_workspace_that_lost_its_record_are_kept(
+    workspace: Workspace, walk: Film, tmp_path: Path
+) -> None:
+    copied = Workspace(shutil.copytree(workspace.root, tmp_path / "scene"))
+    before = {path.name: path.stat().st_mtime_ns for path in copied.frames.iterdir()}
+    copied.manifest.unlink()
+    again = Workspace(copied.root, create=True)
+    pipeline.index_photos(again, walk.path, cfg.ImagesConfig(frames=14), RUN)
+    assert {path.name: path.stat().st_mtime_ns for path in again.frames.iterdir()} == before
+
+
+def test_a_damaged_frame_is_mended_by_one_run(workspace: Workspace, walk: Film, tmp_path: Path) -> None:
+    copied = Workspace(shutil.copytree(workspace.root, tmp_path / "scene"))
+    (copied.frames / read_index(copied).names[0]).write_bytes(b"damaged")
+    pipeline.index_photos(copied, walk.path, cfg.ImagesConfig(frames=14), RUN)
+    assert pipeline.extract_features(copied, cfg.FeaturesConfig(max_features=200), RUN).skipped
 
 
 def test_two_ways_to_choose_frames_exclude_each_other(walk: Film, tmp_path: Path) -> None:

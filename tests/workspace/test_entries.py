@@ -79,9 +79,11 @@ def test_a_manifest_with_a_changed_record_is_damaged(workspace: Workspace) -> No
         Workspace(workspace.root)
 
 
-@pytest.mark.parametrize("name", ["report.html", ".photos.json", "pair_origins.tsv"])
+@pytest.mark.parametrize(
+    "name", ["report.html", ".photos.json", "pair_origins.tsv", "database.db-wal", "pruned/ratio.db-journal"]
+)
 def test_a_folder_in_the_place_of_a_file_is_named(workspace: Workspace, name: str) -> None:
-    (workspace.root / name).mkdir()
+    (workspace.root / name).mkdir(parents=True)
     for use in (workspace.lock, workspace.reading):
         with pytest.raises(WorkspaceError, match=f"{name}: is in the place of a file.*run: rm -r "), use():
             pass

@@ -28,6 +28,14 @@ def test_swapped_photos_of_equal_size_and_time_get_each_their_hash(tmp_path: Pat
     assert [again.hash_of(path) for path in paths] == before[::-1] == [sha256_of(path) for path in paths]
 
 
+def test_a_photo_that_is_replaced_meanwhile_is_read_again(tmp_path: Path) -> None:
+    photo, cache = tmp_path / "a.bmp", PhotoCache(tmp_path / "cache.json")
+    photo.write_bytes(b"one")
+    before = cache.hash_of(photo)
+    photo.write_bytes(b"three")
+    assert before != cache.hash_of(photo) == sha256_of(photo)
+
+
 def test_a_photo_is_remembered_wherever_the_command_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

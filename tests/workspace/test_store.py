@@ -3,6 +3,7 @@
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 import sqlite3
 import time
@@ -332,6 +333,26 @@ def test_every_changed_byte_of_an_item_is_noticed_and_costs_that_item_only(store
             beside.unlink()
     # Bytes that mean nothing, such as those of free space, harm nothing.
     assert silent < 30
+
+
+@pytest.mark.parametrize("look_up", [False, True])
+def test_a_key_that_is_no_text_any_more_is_damage_and_is_mended(store: ItemStore, look_up: bool) -> None:
+    store.add("first photo.jpg", "1", make_features(20, seed=0))
+    store.add("second photo.jpg", "1", make_features(20, seed=1))
+    store.commit({"first photo.jpg": "1", "second photo.jpg": "1"})
+    content = bytearray(store.path.read_bytes())
+    # The row holds the key, and so does the index that keys are looked up in.
+    places = [found.start() for found in re.finditer(b"first photo", content)]
+    assert len(places) == 2
+    content[places[look_up] + 2] ^= 0x80
+    store.path.write_bytes(content)
+    assert store.mend()
+    names = ("first photo.jpg", "second photo.jpg")
+    for name in set(names) - store.finished(dict.fromkeys(names, "1")):
+        store.add(name, "1", make_features(20, seed=0))
+    store.commit(dict.fromkeys(names, "1"))
+    assert store.find_damage() == []
+    assert_same(store.read("second photo.jpg"), make_features(20, seed=1))
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ import numpy as np
 
 from corrsfm import pipeline
 from corrsfm.config import PipelineConfig, to_dict
-from corrsfm.errors import ConfigError
+from corrsfm.errors import ConfigError, InputError
 from corrsfm.evaluation.records import finite_or_none, provenance, save_results
 from corrsfm.evaluation.scenes import DEFAULT_NUM_SEEDS
 from corrsfm.evaluation.scenes.evidence import common_evidence
@@ -42,6 +42,7 @@ from corrsfm.evaluation.scenes.seeds import (
 )
 from corrsfm.evaluation.scenes.sharing import share_stages
 from corrsfm.evaluation.two_view.filters import parse_prune_method
+from corrsfm.files import PAGE_BEGINNING, RESULT_BEGINNING, require_replaceable
 from corrsfm.types import ModelSummary, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs
@@ -110,7 +111,13 @@ def compare_methods(
         raise ConfigError(f"methods {', '.join(methods)}: give at least one, and each only once")
     wanted_seeds(config.run.seed, num_seeds)
     for prune_config in prune_configs.values():
-        pipeline.check_options(config.run, prune_config, features=config.features, matches=config.matches)
+        pipeline.check_options(
+            config.run, prune_config, features=config.features, pairs=config.pairs, matches=config.matches
+        )
+    if output.resolve() == images_dir.resolve():
+        raise InputError(f"{output}: is the folder of the photos; choose another one with --output")
+    require_replaceable(output / "compare.json", "a result file", RESULT_BEGINNING)
+    require_replaceable(output / "compare.html", "a page of corrsfm", PAGE_BEGINNING)
     truth = read_truth(ground_truth) if ground_truth else None
     base = Workspace(output / "base", create=True)
     _prepare(base, images_dir, config, overwrite)

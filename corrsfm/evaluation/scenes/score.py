@@ -92,8 +92,9 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     Parameters
     ----------
     folder : Path
-        A COLMAP model, binary or text, or a folder of camera files: ``PHOTO.json``, the photo's name with its
-        suffix, each an object with ``rotation`` (3 × 3, rows) and ``translation`` (3) of ``cam_from_world``.
+        A COLMAP model, binary or text, a workspace or another folder that `find_model` finds one in, or a
+        folder of camera files: ``PHOTO.json``, the photo's name with its suffix, each an object with
+        ``rotation`` (3 × 3, rows) and ``translation`` (3) of ``cam_from_world``.
 
     Returns
     -------
@@ -105,10 +106,15 @@ def read_poses(folder: Path) -> dict[str, Pose]:
     InputError
         If the folder holds neither, or a file is damaged.
     """
-    from corrsfm.colmap.models import is_model, poses_of, read_model
+    from corrsfm.colmap.models import find_model, poses_of, read_model
 
-    if is_model(folder):
-        return poses_of(read_model(folder))
+    try:
+        model = find_model(folder)
+    except InputError:
+        if (folder / "workspace.json").exists():
+            raise
+    else:
+        return poses_of(read_model(model))
     files = sorted(folder.rglob("*.json")) if folder.is_dir() else []
     if not files:
         raise InputError(
@@ -166,8 +172,9 @@ def _read_camera(path: Path) -> Pose:
         rotation = np.array(values["rotation"], np.float64).reshape(3, 3)
         translation = np.array(values["translation"], np.float64).reshape(3)
     except (OSError, ValueError, KeyError, TypeError) as error:
+        what = f"lacks {error}" if isinstance(error, KeyError) else error
         raise InputError(
-            f"{path}: not a camera file ({error!r}); expected 'rotation' (3 × 3) and 'translation' (3) of "
+            f"{path}: not a camera file ({what}); expected 'rotation' (3 × 3) and 'translation' (3) of "
             "cam_from_world"
         ) from error
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:

@@ -254,6 +254,21 @@ def test_a_network_without_weights_is_refused_before_any_work(tmp_path: Path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["compare.json", "compare.html"])
+def test_files_of_others_are_not_replaced(tmp_path: Path, name: str):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).write_text("<!DOCTYPE html>\n<p>mine")
+    with pytest.raises(InputError, match=f"{name}: exists and is not a"):
+        compare_methods(tmp_path, tmp_path / "out", ["ratio"], CONFIG, num_seeds=1)
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [name]
+
+
+def test_results_do_not_go_among_the_photos(tmp_path: Path):
+    with pytest.raises(InputError, match="is the folder of the photos; choose another one with --output"):
+        compare_methods(tmp_path, tmp_path, ["ratio"], CONFIG, num_seeds=1)
+    assert not list(tmp_path.iterdir())
+
+
 def test_folder_names_are_safe():
     assert method_folder("corradaptor@pose:/models/a b.pt") == "corradaptor_pose_models_a_b.pt"
     assert method_folder("../") == "_"

@@ -1,6 +1,7 @@
 """Reconstructions against known cameras: perfect ones, incomplete ones, bent ones, and both file layouts."""
 
 import json
+import shutil
 from pathlib import Path
 
 import cv2  # noqa: F401  (before pycolmap)
@@ -118,8 +119,13 @@ def test_what_cannot_be_compared_is_explained(truth_dir: Path, tmp_path: Path):
     with pytest.raises(InputError, match=r"b\.jpg\.json: 'rotation' is not a rotation matrix"):
         read_poses(tmp_path)
     (tmp_path / "b.jpg.json").write_text("{}")
-    with pytest.raises(InputError, match=r"b\.jpg\.json: not a camera file"):
+    with pytest.raises(InputError, match=r"b\.jpg\.json: not a camera file \(lacks 'rotation'\)"):
         read_poses(tmp_path)
+    (tmp_path / "workspace.json").write_text("{}")
+    with pytest.raises(InputError, match="for a workspace run: corrsfm reconstruct"):
+        read_poses(tmp_path)
+    shutil.copytree(truth_dir, tmp_path / "sparse" / "0")
+    assert read_poses(tmp_path).keys() == read_poses(truth_dir).keys()
 
 
 def test_command_prints_the_score(truth_dir: Path, tmp_path: Path):
