@@ -38,7 +38,8 @@ __all__ = ["SceneStatus", "find_scenes", "run_collection"]
 logger = logging.getLogger("corrsfm")
 
 LOG_NAME = "batch.log"
-GRACE_SECONDS = 10.0
+# Shorter than what a command has to clear up after SIGTERM, so that there is time to tell how to go on.
+GRACE_SECONDS = 5.0
 POLL_SECONDS = 0.5
 
 
@@ -323,7 +324,9 @@ class _Processes:
 @contextlib.contextmanager
 def _terminable() -> Iterator[None]:
     """Turn SIGTERM into an interruption; by default it ends this process and leaves its scenes running."""
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set handlers
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    # Only there a handler may be set; a command has one already, which knows what to say.
+    if not in_main_thread or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
         yield
         return
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import importlib.machinery
 import logging
@@ -52,7 +51,7 @@ class _Caught:
         self.number = self.number or number
         # In the middle of it native code takes the exception for a broken package, or ends the process.
         if _is_importing(frame):
-            _come_again()
+            _come_again(number)
         else:
             raise KeyboardInterrupt
 
@@ -68,8 +67,10 @@ def _is_importing(frame: FrameType | None) -> bool:
     return False
 
 
-def _come_again() -> None:
-    again = threading.Timer(AGAIN_AFTER_SECONDS, _thread.interrupt_main)
+def _come_again(number: int) -> None:
+    # As itself: where Ctrl-C is ignored, as in background jobs, that would be lost.
+    main = threading.main_thread().ident
+    again = threading.Timer(AGAIN_AFTER_SECONDS, signal.pthread_kill, [main, number])
     again.daemon = True
     again.start()
 
@@ -117,7 +118,7 @@ def interruptible() -> Iterator[None]:
 def _interrupt_again(dropped: Any) -> None:
     """Repeat an interruption that came where Python has nobody to tell, as in a destructor."""
     if isinstance(dropped.exc_value, KeyboardInterrupt):
-        _come_again()
+        _come_again(_caught.number or signal.SIGINT)
     else:
         sys.__unraisablehook__(dropped)
 

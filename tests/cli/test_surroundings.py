@@ -142,6 +142,54 @@ def test_an_interrupted_import_is_not_taken_for_a_missing_package(tmp_path: Path
     )  # fmt: skip
 
 
+def test_a_background_job_that_is_terminated_while_it_imports_says_so(tmp_path: Path) -> None:
+    code = (
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
+        "from corrsfm.cli import main\n"
+        "class Finder:\n"
+        "    def find_spec(name, path, target=None):\n"
+        "        if name == 'decimal':\n"
+        "            signal.raise_signal(signal.SIGTERM)\n"
+        "def check(**_):\n"
+        "    sys.modules.pop('decimal', None)\n"
+        "    import decimal\n"
+        "    time.sleep(60)\n"
+        "sys.meta_path.insert(0, Finder)\n"
+        "main.commands['check'].callback = check\n"
+        "main(['check', 'photos'], prog_name='corrsfm')\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
+    assert (result.returncode, result.stderr.splitlines()) == (
+        143, ["Error: terminated; run the same command again to go on"],
+    )  # fmt: skip
+
+
+def test_a_terminated_batch_says_so_whatever_its_scenes_do(tmp_path: Path) -> None:
+    (tmp_path / "photos" / "a").mkdir(parents=True)
+    (tmp_path / "photos" / "a" / "1.png").touch()
+    scene = tmp_path / "scene"
+    scene.write_text("#!/bin/sh\ntrap '' TERM\ntouch begun\nsleep 60\n")
+    scene.chmod(0o755)
+    code = (
+        "import os, signal, sys, threading, time, corrsfm.batch\n"
+        "from corrsfm.cli import main\n"
+        "corrsfm.batch.GRACE_SECONDS = 0.5\n"
+        "sys.executable = './scene'\n"
+        "def terminate():\n"
+        "    while not os.path.exists('begun'):\n"
+        "        time.sleep(0.02)\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "threading.Thread(target=terminate, daemon=True).start()\n"
+        "main(['--quiet', 'batch', 'photos', 'out'], prog_name='corrsfm')\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, cwd=tmp_path
+    )
+    assert result.returncode == 143
+    assert result.stderr.splitlines()[-1].startswith("Error: terminated; ")
+
+
 def test_a_command_that_is_still_being_loaded_ends_without_a_word(tmp_path: Path) -> None:
     code = (
         "import sys, signal, corrsfm.__main__\n"
