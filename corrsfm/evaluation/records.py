@@ -11,7 +11,7 @@ import json
 import math
 import platform
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -124,9 +124,24 @@ def load_results(path: Path, kind: str | None = None) -> dict[str, Any]:
 
 
 def kept_methods(
-    results: Path | None, kind: str, subject: dict[str, Any], *, overwrite: bool
+    results: Path | None,
+    kind: str,
+    subject: dict[str, Any],
+    read: Callable[[dict[str, Any]], object],
+    *,
+    overwrite: bool,
 ) -> dict[str, Any]:
     """Read the methods that a result file already holds for the same subject.
+
+    Parameters
+    ----------
+    results : Path, optional
+    kind : str
+    subject : dict
+    read : callable
+        Called with each method's entry; raises KeyError, TypeError or ValueError if that cannot be used.
+    overwrite : bool
+        Keep none.
 
     Raises
     ------
@@ -138,12 +153,23 @@ def kept_methods(
     values = load_results(results, kind)
     if overwrite:
         return {}
-    if values["subject"] != subject:
+    try:
+        other, methods = dict(values["subject"]), dict(values["methods"])
+        if other != subject:
+            raise InputError(
+                f"{results}: measured on something else than asked for ({other.get('name')}, "
+                f"{other.get('num_pairs')} pairs); use --overwrite or another file"
+            )
+        for entry in methods.values():
+            if not isinstance(entry["fingerprint"], str):
+                raise TypeError("a fingerprint is no text")
+            read(entry)
+    except (KeyError, TypeError, ValueError) as error:
+        what = f"lacks {error}" if isinstance(error, KeyError) else error
         raise InputError(
-            f"{results}: measured on something else than asked for ({values['subject'].get('name')}, "
-            f"{values['subject'].get('num_pairs')} pairs); use --overwrite or another file"
-        )
-    return dict(values["methods"])
+            f"{results}: damaged ({what}); use --overwrite to measure again, or another file"
+        ) from error
+    return methods
 
 
 def save_results(path: Path, kind: str, values: dict[str, Any]) -> None:

@@ -254,7 +254,11 @@ def evaluate_homography(
         "sequences": [sequence.name for sequence in sequences],
         "features": to_dict(features),
     }
-    entries = kept_methods(results, "homography", subject, overwrite=overwrite)
+
+    def read(entry: dict[str, Any]) -> list[Any]:
+        return [entry["summary"][name] for name in ("num_failed", "num_kept", "auc", "auc_interval")]
+
+    entries = kept_methods(results, "homography", subject, read, overwrite=overwrite)
     missing = [f for f in built if entries.get(f.name, {}).get("fingerprint") != f.fingerprint]
     measured = _measure(missing, sequences, features, on_sequence) if missing else {}
     for pair_filter in missing:

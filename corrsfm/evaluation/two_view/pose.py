@@ -223,7 +223,10 @@ def _to_json(scores: PairScores) -> dict[str, list[float | None]]:
 
 def _from_json(values: dict[str, list[float | None]]) -> PairScores:
     return PairScores(
-        **{name: np.array([math.inf if v is None else v for v in values[name]]) for name in _PER_PAIR}
+        **{
+            name: np.array([math.inf if v is None else v for v in values[name]], np.float64)
+            for name in _PER_PAIR
+        }
     )
 
 
@@ -306,7 +309,12 @@ def evaluate_pose(
     """
     built = [parse_method(name, device=device, seed=seed, threads=threads) for name in methods]
     subject = _load_subject(path, max_per_scene, seed)
-    old = kept_methods(results, "pose", subject.description, overwrite=overwrite)
+
+    def read(entry: dict[str, Any]) -> None:
+        if {len(values) for values in vars(_from_json(entry["pairs"])).values()} != {len(subject.pairs)}:
+            raise ValueError("other numbers of pairs")
+
+    old = kept_methods(results, "pose", subject.description, read, overwrite=overwrite)
     entries: dict[str, Any] = dict(old)
     groups: dict[str, list[TwoViewMethod]] = {}
     for method in built:

@@ -142,6 +142,29 @@ def test_results_of_other_pairs_are_not_mixed(pairs_file: Path, tmp_path: Path):
         evaluate_pose(pairs_file, ["mutual/poselib"], results=results, max_per_scene=1)
 
 
+@pytest.mark.parametrize("damage", ["subject", "methods", "fingerprint", "pairs", "number", "length"])
+def test_damaged_results_are_named(pairs_file: Path, tmp_path: Path, damage: str):
+    results = tmp_path / "pose.json"
+    evaluate_pose(pairs_file, ["mutual/poselib"], results=results)
+    values = json.loads(results.read_text())
+    entry = values["methods"]["mutual/poselib"]
+    match damage:
+        case "subject":
+            values["subject"] = None
+        case "methods":
+            del values["methods"]
+        case "fingerprint" | "pairs":
+            del entry[damage]
+        case "number":
+            entry["pairs"]["precision"][0] = "x"
+        case _:
+            del entry["pairs"]["precision"][0]
+    results.write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"pose\.json: damaged .*--overwrite"):
+        evaluate_pose(pairs_file, ["mutual/poselib"], results=results)
+    evaluate_pose(pairs_file, ["mutual/poselib"], results=results, overwrite=True)
+
+
 def test_files_that_are_no_results_are_not_overwritten(pairs_file: Path, tmp_path: Path):
     (tmp_path / "mine.json").write_text('{"precious": 1}')
     with pytest.raises(InputError, match="not a result file"):
