@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -75,7 +76,9 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     try:
         return _read(folder)
     except _UNREADABLE as error:
-        raise InputError(f"{folder}: COLMAP model cannot be read ({error})") from error
+        # pycolmap says first where in its source it was.
+        what = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error))
+        raise InputError(f"{folder}: COLMAP model cannot be read ({what})") from error
 
 
 def _read(folder: Path) -> pycolmap.Reconstruction:

@@ -116,6 +116,16 @@ def _convert(annotation: Any, value: Any) -> Any:
     return value
 
 
+_WORDS = {
+    dict: "a table",
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    Path: "a path",
+    str: "text",
+}
+
+
 def _expected(annotation: Any) -> str:
     if typing.get_origin(annotation) is typing.Literal:
         return "one of " + ", ".join(str(choice) for choice in typing.get_args(annotation))
@@ -126,7 +136,8 @@ def _expected(annotation: Any) -> str:
     ]
     if choices:
         return "one of " + ", ".join(choices[0])
-    return getattr(annotation, "__name__", str(annotation))
+    kinds = (annotation, typing.get_origin(annotation), *typing.get_args(annotation))
+    return next(words for kind, words in _WORDS.items() if kind in kinds)
 
 
 def from_dict(cls: type[T], values: dict[str, Any], where: str) -> T:

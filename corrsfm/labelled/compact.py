@@ -230,6 +230,9 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
 
 def _decode(name: str, group: h5py.Group) -> CompactScene:
     stored = {key: group[key][()] for key in group if key not in ("image_names", "camera_models")}
+    for key in ("pairs", "covisible", "keypoint_offsets", "match_offsets", "neighbours"):
+        if not np.issubdtype(stored[key].dtype, np.integer):
+            raise ValueError(f"{key} holds {stored[key].dtype}, expected whole numbers")
     sizes, offsets = stored["image_sizes"], stored["keypoint_offsets"]
     cameras = tuple(
         Camera(

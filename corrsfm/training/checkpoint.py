@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
+import shlex
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from corrsfm.errors import CheckpointError
 from corrsfm.files import atomic_path
 from corrsfm.model import CorrAdaptor
 
-__all__ = ["Average", "load_state", "save_state", "without_side_channels"]
+__all__ = ["Average", "damaged_state", "load_state", "save_state", "without_side_channels"]
 
 _FORMAT = "corrsfm-training-1"
 
@@ -76,14 +77,24 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
         If the file is missing or holds something else.
     """
     try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except (OSError, RuntimeError, pickle.UnpicklingError, EOFError) as error:
-        raise CheckpointError(
-            f"{path}: damaged, or not the state of a training run; start again, without --resume"
-        ) from error
-    if not isinstance(state, dict) or state.get("format") != _FORMAT:
-        raise CheckpointError(f"{path}: not the state of a training run; start without --resume")
+        with warnings.catch_warnings():
+            # torch has its own to say of other files.
+            warnings.simplefilter("ignore")
+            state = torch.load(path, map_location=device, weights_only=True)
+        if state["format"] != _FORMAT:
+            raise ValueError("of another format")
+    # Whatever torch stumbles over in damaged bytes.
+    except Exception as error:
+        raise damaged_state(path) from error
     return state
+
+
+def damaged_state(path: Path) -> CheckpointError:
+    """The error for a state that cannot be used."""
+    return CheckpointError(
+        f"{path}: damaged, or not the state of a training run; to begin that again: "
+        f"{shlex.join(['rm', str(path)])}"
+    )
 
 
 def without_side_channels(network: CorrAdaptor, num_left: int, neutral: Sequence[float]) -> CorrAdaptor:

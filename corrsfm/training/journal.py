@@ -17,7 +17,21 @@ from corrsfm.errors import ConfigError, DependencyError
 from corrsfm.machine import versions
 from corrsfm.training.config import TrainRecipe
 
-__all__ = ["Journal", "described_recipe", "hardware"]
+__all__ = ["Journal", "described_recipe", "hardware", "make_output"]
+
+
+def make_output(folder: Path) -> None:
+    """Make the folder of a run, if it is missing.
+
+    Raises
+    ------
+    ConfigError
+        If it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be made ({error.strerror}); choose another --output") from error
 
 
 class Journal:
@@ -36,12 +50,7 @@ class Journal:
     def __init__(
         self, folder: Path, *, tensorboard: bool, on_row: Callable[[dict[str, Any]], None] | None = None
     ) -> None:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(
-                f"{folder}: cannot be made ({error.strerror}); choose another --output"
-            ) from error
+        make_output(folder)
         self._folder, self._tensorboard, self._on_row = folder, tensorboard, on_row
         self._writer: Any = None
 

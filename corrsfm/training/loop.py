@@ -14,7 +14,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,15 +26,16 @@ from corrsfm.errors import ConfigError
 from corrsfm.labelled.compact import read_scenes
 from corrsfm.model import CorrAdaptor, Rival, RivalConfig, build_network, save_network
 from corrsfm.prune.correspondences import missing_channels
-from corrsfm.training.checkpoint import Average, load_state, save_state
+from corrsfm.training.checkpoint import Average, damaged_state, load_state, save_state
 from corrsfm.training.config import TrainRecipe
 from corrsfm.training.dataset import Batch, RealPairs, concatenate, generator_for, side_information
 from corrsfm.training.initial import initial_network
-from corrsfm.training.journal import Journal, described_recipe, hardware
+from corrsfm.training.journal import Journal, described_recipe, hardware, make_output
 from corrsfm.training.objectives import objective
 from corrsfm.training.schedule import learning_rate_factor
 from corrsfm.training.synthetic import SyntheticPairs
 from corrsfm.training.validation import Validation
+from corrsfm.workspace.lease import hold
 
 __all__ = ["Trainer", "train"]
 
@@ -79,7 +80,7 @@ def train(
     # If it is unusable, now and not after hours.
     if options.val_file is not None:
         read_scenes(options.val_file)
-    with _process_group(torch.device(device)) as (rank, own_device):
+    with _process_group(torch.device(device)) as (rank, own_device), ExitStack() as stack:
         data = RealPairs.from_files(
             options.train_files,
             own_device,
@@ -87,6 +88,8 @@ def train(
             match_input=options.input,
             negative_share=options.negative_share,
         )
+        if rank == 0:
+            stack.enter_context(_held(options.output))
         trainer = Trainer(recipe, data, own_device, rank=rank, on_log=on_log)
         channels = trainer.network.side_channels
         if missing := missing_channels(channels, has_shapes=data.has_shapes, has_ratios=True):
@@ -101,6 +104,17 @@ def train(
                 )
             trainer.load()
         return trainer.run()
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Hold the folder of a run for this process, and refuse one with weights that no run left there."""
+    weights = folder / "latest.pt"
+    if weights.exists() and not (folder / "recipe.json").exists():
+        raise ConfigError(f"{weights}: is of no run in this folder; move it away, or choose another --output")
+    make_output(folder)
+    with hold(folder / ".lock"):
+        yield
 
 
 @contextmanager
@@ -284,6 +298,12 @@ class Trainer:
     def load(self) -> None:
         """Continue from the last state in the run's folder."""
         state = load_state(self.state_path, self.device)
+        try:
+            self._continue(state)
+        except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise damaged_state(self.state_path) from error
+
+    def _continue(self, state: dict[str, Any]) -> None:
         if state["network_config"] != json.dumps(to_dict(self.network.config)):
             raise ConfigError(
                 f"{self.state_path}: belongs to another network; use another --output or the same recipe"

@@ -194,7 +194,7 @@ class Workspace(Ledger):
                 except BlockingIOError as error:
                     who = holder_of(handle)
                     raise WorkspaceError(
-                        f"{self.root}: another corrsfm works in this workspace{who}; wait for it"
+                        f"{self.root}: another corrsfm works in this folder{who}; wait for it"
                     ) from error
             check_entries(self.root, self._own_names, may_link=True)
             self._values = read_manifest(self.manifest)

@@ -129,8 +129,7 @@ def _take(path: Path, me: _Holder, wait: bool) -> FileIO:
         may_be_dead = state is _State.UNSURE and seen in (None, renewed)
         if not wait and not may_be_dead:
             raise WorkspaceError(
-                f"{path.parent}: another corrsfm works in this workspace{who}; wait for it or choose another "
-                "folder"
+                f"{path.parent}: another corrsfm works in this folder{who}; wait for it or choose another one"
             )
         if seen is None:
             logger.warning("%s: waiting for another corrsfm%s to end", path.parent, who)
@@ -190,6 +189,9 @@ def _open(path: Path) -> FileIO:
             f"{path}: is a folder, pipe or device, expected a file; run: {removal}"
         ) from error
     except OSError as error:
+        if error.errno == errno.ELOOP:
+            removal = shlex.join(["rm", str(path)])
+            raise WorkspaceError(f"{path}: is a link, expected a file; run: {removal}") from error
         if isinstance(error, PermissionError) and _is_of_another(path.parent):
             opening = shlex.join(["sudo", "chmod", "-R", "a+rwX", str(path.parent)])
             raise WorkspaceError(

@@ -100,7 +100,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except PermissionError as error:
         raise WorkspaceError(explain(error)) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        if isinstance(error, KeyError | TypeError | AttributeError):
+            reason = f"lacks {error}" if isinstance(error, KeyError) else "not what a workspace records"
         raise WorkspaceError(
             f"{path}: damaged ({reason}); remove it alone, with: {shlex.join(['rm', '-r', str(path)])}; then "
             "run the commands of the workspace again, finished features and matches are kept"

@@ -25,22 +25,25 @@ logger = logging.getLogger("corrsfm")
 
 TRIAL_SECONDS = 20.0
 SECONDS_PER_MB = 0.2
-# Everything that is looked up later, so that an index that leads nowhere shows here; and files that end too
-# early, of which pycolmap makes up the rest, are longer when they are written again.
+# Numbers that no model has, of which one flipped bit makes wild ones; everything that is looked up later, so
+# that an index that leads nowhere shows here; and files that end too early, of which pycolmap makes up the
+# rest, are longer when they are written again.
 _TRIAL = """
 import sys, tempfile, pathlib, numpy, pycolmap
 folder = pathlib.Path(sys.argv[1])
 model = pycolmap.Reconstruction(folder)
 for camera in model.cameras.values():
     assert numpy.isfinite(camera.params).all() and camera.width > 0 and camera.height > 0
+    assert all(camera.params[number] > 0 for number in camera.focal_length_idxs())
 with tempfile.TemporaryDirectory() as copy:
     model.write_binary(copy)
     for path in folder.glob("*.bin"):
         assert path.stat().st_size == (pathlib.Path(copy) / path.name).stat().st_size, path
 for image in model.images.values():
-    image.camera.params, image.has_pose and image.cam_from_world()
+    assert not image.has_pose or numpy.abs(image.cam_from_world().matrix()).max() < 1e12
     assert all(model.exists_point3D(p.point3D_id) for p in image.points2D if p.has_point3D())
 for point in model.points3D.values():
+    assert numpy.abs(point.xyz).max() < 1e12
     for element in point.track.elements:
         model.images[element.image_id].points2D[element.point2D_idx]
 """

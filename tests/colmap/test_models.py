@@ -58,7 +58,7 @@ def test_files_that_end_elsewhere_than_their_entries_are_refused(model: Path, na
         b"\xff" * len(whole),
     ):
         (model / name).write_bytes(content)
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match=r"cannot be read \((?!\[)"):
             read_model(model)
 
 

@@ -54,7 +54,7 @@ def test_all_errors_of_a_pipeline_file_are_reported_at_once(tmp_path: Path) -> N
         "unknown key 'features.size', valid are extractor, max_features",
         "prune.method is 'magic', expected one of none, ratio",
         "unknown key 'colour', valid are images, features",
-        "run.seed is 'x', expected int",
+        "run.seed is 'x', expected a whole number",
     ):
         assert part in text
 

@@ -10,7 +10,7 @@ import torch
 from labelled_scene import make_scene
 
 from corrsfm.config import MatchInput
-from corrsfm.errors import CheckpointError, ConfigError
+from corrsfm.errors import CheckpointError, ConfigError, WorkspaceError
 from corrsfm.labelled.compact import write_scenes
 from corrsfm.model import load_network, read_provenance, save_network
 from corrsfm.training import loop
@@ -20,6 +20,7 @@ from corrsfm.training.dataset import RealPairs, generator_for
 from corrsfm.training.initial import network_config
 from corrsfm.training.loop import Trainer, train
 from corrsfm.training.schedule import learning_rate_factor
+from corrsfm.workspace.lease import hold
 
 CPU = torch.device("cpu")
 TINY = {
@@ -198,7 +199,39 @@ def test_resuming_another_network_is_refused(data, tmp_path):
         Trainer(other, data, CPU).load()
 
 
-def test_a_state_of_another_kind_is_refused(tmp_path):
-    torch.save({"format": "other"}, tmp_path / "state.pt")
-    with pytest.raises(CheckpointError, match="not the state"):
-        load_state(tmp_path / "state.pt", CPU)
+@pytest.mark.parametrize("content", [b"", b"hello world", b"PK\x03\x04", None])
+def test_a_state_of_another_kind_is_refused(tmp_path, content):
+    path = tmp_path / "state.pt"
+    torch.save({"format": "other"}, path) if content is None else path.write_bytes(content)
+    with pytest.raises(CheckpointError, match=f"not the state of a training run; .*: rm {path}"):
+        load_state(path, CPU)
+
+
+@pytest.mark.parametrize("name", ["network", "optimiser", "random", "step"])
+def test_a_damaged_state_can_be_removed_to_begin_again(tmp_path, name):
+    write_scenes(tmp_path / "train.h5", [make_scene("a")])
+    recipe = make_recipe(tmp_path / "run", max_steps=2, train_files=(tmp_path / "train.h5",))
+    train(recipe, device=CPU)
+    path = tmp_path / "run" / "state.pt"
+    state = load_state(path, CPU)
+    if name == "network":
+        state[name] = {f"{key}?": value for key, value in state[name].items()}
+    else:
+        del state[name]
+    torch.save(state, path)
+    with pytest.raises(CheckpointError, match=f"damaged.*: rm {path}"):
+        train(recipe, device=CPU, resume=True)
+    path.unlink()
+    train(recipe, device=CPU)
+
+
+def test_the_folder_of_a_run_is_for_one_run_alone(tmp_path):
+    write_scenes(tmp_path / "train.h5", [make_scene("a")])
+    recipe = make_recipe(tmp_path / "run", max_steps=2, train_files=(tmp_path / "train.h5",))
+    (tmp_path / "run").mkdir()
+    with hold(tmp_path / "run" / ".lock"), pytest.raises(WorkspaceError, match="another corrsfm works in"):
+        train(recipe, device=CPU)
+    (tmp_path / "run" / "latest.pt").write_text("mine")
+    with pytest.raises(ConfigError, match=r"latest\.pt: is of no run in this folder; move it away"):
+        train(recipe, device=CPU)
+    assert (tmp_path / "run" / "latest.pt").read_text() == "mine"

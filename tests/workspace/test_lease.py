@@ -68,7 +68,7 @@ def no_locks(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_another_process_is_named_and_its_death_frees_the_folder(path: Path) -> None:
     other = holder(path)
     with (
-        pytest.raises(WorkspaceError, match=rf"works in this workspace \(process {other.pid} on "),
+        pytest.raises(WorkspaceError, match=rf"works in this folder \(process {other.pid} on "),
         hold(path),
     ):
         pass

@@ -2,6 +2,9 @@
 
 from pathlib import Path
 
+import cv2  # noqa: F401  (before pycolmap)
+import numpy as np
+import pycolmap
 import pytest
 from finished_scene import make_finished_scene
 
@@ -28,6 +31,22 @@ def test_a_model_that_another_program_adjusted_is_used_with_a_warning(
     (again,) = models_of(workspace)
     assert "changed since corrsfm wrote it" in caplog.text
     assert again.num_points3D() == model.num_points3D()
+
+
+@pytest.mark.parametrize("wild", ["point", "pose", "focal length"])
+def test_a_model_of_impossible_numbers_is_damaged(workspace: Workspace, wild: str) -> None:
+    (model,) = models_of(workspace)
+    if wild == "point":
+        next(iter(model.points3D.values())).xyz = np.full(3, np.nan)
+    elif wild == "pose":
+        frame = next(iter(model.frames.values()))
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.array([0.0, 1e300, 0.0]))
+    else:
+        camera = next(iter(model.cameras.values()))
+        camera.params = [-camera.params[0], *camera.params[1:]]
+    model.write_binary(workspace.sparse / "0")
+    with pytest.raises(WorkspaceError, match="0: damaged, not as it was written; make it again with: "):
+        models_of(workspace)
 
 
 def test_what_others_put_among_the_models_is_told_from_what_corrsfm_wrote(workspace: Workspace) -> None:
