@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import re
 import shlex
 import shutil
 import sqlite3
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,6 +140,18 @@ def _exchange(content: bytearray, rng: random.Random) -> bytearray:
     return content
 
 
+def _spoil_text(content: bytearray, rng: random.Random) -> bytearray:
+    """Make a photo's name, wherever it is, something else than UTF-8."""
+    places = [found.start() for found in re.finditer(rb"\.jpg", content)]
+    if places:
+        content[rng.choice(places) + 1] ^= 0x80
+    return content
+
+
+# Where COLMAP's files hold the focal length of the first camera, and where its first point is.
+_FIRST_NUMBERS = {"cameras.bin": 32, "points3D.bin": 16}
+
+
 def _ways_of_files(name: str) -> dict[str, Callable]:
     def way(change: Callable, label: str) -> Callable:
         return _on_bytes(change, f"{name} {label}")
@@ -165,6 +179,15 @@ def _ways_of_files(name: str) -> dict[str, Callable]:
         ways[f"zero block {number}"] = way(_zero, f"zero {number}")
         ways[f"double block {number}"] = way(_double, f"double {number}")
         ways[f"exchange blocks {number}"] = way(_exchange, f"exchange {number}")
+    if name.endswith(".db"):
+        for number in range(3):
+            ways[f"no text {number}"] = way(_spoil_text, f"no text {number}")
+        ways["log a folder"] = lambda path, _: path.with_name(f"{path.name}-wal").mkdir()
+        ways["journal a folder"] = lambda path, _: path.with_name(f"{path.name}-journal").mkdir()
+    if (place := _FIRST_NUMBERS.get(Path(name).name)) is not None:
+        for label, value in (("nan", math.nan), ("negative", -1e300), ("infinite", math.inf)):
+            number = struct.pack("<d", value)
+            ways[f"number {label}"] = way(lambda c, _, n=number: c[:place] + n + c[place + 8 :], label)
     return ways
 
 
@@ -404,8 +427,15 @@ def try_damage(
 
 def _without_lost(expected: dict[str, Any], said: list[str]) -> dict[str, Any]:
     """What must be there again when a scene is mended: all but what was said to be lost."""
-    is_lost = any("what it says of added photos is lost" in one for one in said)
-    return {name: what for name, what in expected.items() if not (is_lost and name == "added.json")}
+    lost = {
+        name
+        for name, text in (
+            ("added.json", "what it says of added photos is lost"),
+            ("evidence.json", "the verdict is lost"),
+        )
+        if any(text in one for one in said)
+    }
+    return {name: what for name, what in expected.items() if name not in lost}
 
 
 def _was_told(said: list[str]) -> bool:

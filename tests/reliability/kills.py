@@ -230,6 +230,7 @@ def _tables(path: Path) -> dict[str, Any]:
     """Rows of every table of a database, without the seconds of items."""
     found = {}
     with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro&immutable=1", uri=True)) as connection:
+        connection.text_factory = lambda raw: raw.decode("utf-8", "replace")
         tables = [
             name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
         ]
