@@ -12,6 +12,10 @@ from corrsfm.config import Precision, RunConfig
 
 __all__ = ["bench"]
 
+# With many more the system ends the process for want of memory, without a word.
+LARGEST_SIZE = 50_000
+LARGEST_BATCH = 1024
+
 
 @click.command()
 @click.option(
@@ -22,7 +26,7 @@ __all__ = ["bench"]
 @click.option(
     "--num-matches",
     "sizes",
-    type=click.IntRange(min=32),
+    type=click.IntRange(min=32, max=LARGEST_SIZE),
     multiple=True,
     default=(500, 1000, 2000),
     show_default=True,
@@ -31,7 +35,7 @@ __all__ = ["bench"]
 @click.option(
     "--batch-size",
     "batch_sizes",
-    type=click.IntRange(min=1),
+    type=click.IntRange(min=1, max=LARGEST_BATCH),
     multiple=True,
     default=(1,),
     show_default=True,
