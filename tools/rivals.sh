@@ -8,10 +8,11 @@
 #
 # Without names: all of them. pairs/ holds what `corrsfm train prepare` makes, see the recipes. A run that was
 # stopped goes on where it was, and what is measured already is not measured again. The minutes are those of
-# the processor, so that a network that ran beside other work had no less than the rest.
+# the processor, so that a network that ran beside other work had no less than the rest. NAME_side is a network
+# that reads side information, and mutual neighbours only.
 set -euo pipefail
 
-usage() { sed -n '2,11p' "$0" | sed 's/^# \{0,1\}//' >&2; exit 2; }
+usage() { sed -n '2,12p' "$0" | sed 's/^# \{0,1\}//' >&2; exit 2; }
 [ $# -ge 1 ] || usage
 task=$1
 shift
