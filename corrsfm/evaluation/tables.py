@@ -63,7 +63,7 @@ def _pose_table(values: dict[str, Any]) -> Table:
         s = method["summary"]
         rows.append(
             [
-                name.replace("/", " / ") + (" (baseline)" if name == values["baseline"] else ""),
+                " / ".join(name.rsplit("/", 1)) + (" (baseline)" if name == values["baseline"] else ""),
                 _number(s["auc"]["5"]) + _range(s["auc_interval"]["5"]),
                 _number(s["auc"]["10"]),
                 _number(s["auc"]["20"]),
