@@ -83,6 +83,10 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
             state = torch.load(path, map_location=device, weights_only=True)
         if state["format"] != _FORMAT:
             raise ValueError("of another format")
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (MemoryError, torch.OutOfMemoryError):
+        raise
     # Whatever torch stumbles over in damaged bytes.
     except Exception as error:
         raise damaged_state(path) from error
@@ -93,7 +97,7 @@ def damaged_state(path: Path) -> CheckpointError:
     """The error for a state that cannot be used."""
     return CheckpointError(
         f"{path}: damaged, or not the state of a training run; to begin that again: "
-        f"{shlex.join(['rm', str(path)])}"
+        f"{shlex.join(['mv', str(path), f'{path}.damaged'])}"
     )
 
 

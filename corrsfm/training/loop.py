@@ -300,6 +300,8 @@ class Trainer:
         state = load_state(self.state_path, self.device)
         try:
             self._continue(state)
+        except torch.OutOfMemoryError:
+            raise
         except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise damaged_state(self.state_path) from error
 

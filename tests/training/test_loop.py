@@ -203,7 +203,7 @@ def test_resuming_another_network_is_refused(data, tmp_path):
 def test_a_state_of_another_kind_is_refused(tmp_path, content):
     path = tmp_path / "state.pt"
     torch.save({"format": "other"}, path) if content is None else path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=f"not the state of a training run; .*: rm {path}"):
+    with pytest.raises(CheckpointError, match=f"not the state of a training run; .*: mv {path} {path}.damaged"):
         load_state(path, CPU)
 
 
@@ -219,7 +219,7 @@ def test_a_damaged_state_can_be_removed_to_begin_again(tmp_path, name):
     else:
         del state[name]
     torch.save(state, path)
-    with pytest.raises(CheckpointError, match=f"damaged.*: rm {path}"):
+    with pytest.raises(CheckpointError, match=f"damaged.*: mv {path} {path}.damaged"):
         train(recipe, device=CPU, resume=True)
     path.unlink()
     train(recipe, device=CPU)
