@@ -277,11 +277,19 @@ def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
     """Arguments that give each concurrent scene its share of the cores, unless the user chose."""
     if jobs == 1 or any(argument.split("=")[0] == "--threads" for argument in arguments):
         return []
-    for argument, following in itertools.pairwise([*arguments, ""]):
-        flag, _, value = argument.partition("=")
-        if flag == "--pipeline" and load_pipeline(Path(value or following)).run.threads:
-            return []
+    pipeline = _value_of("--pipeline", arguments)
+    if pipeline and load_pipeline(Path(pipeline)).run.threads:
+        return []
     return ["--threads", str(max(1, count_threads(0) // jobs))]
+
+
+def _value_of(flag: str, arguments: Sequence[str]) -> str:
+    """The value that is given for an option; empty if it is not there."""
+    for argument, following in itertools.pairwise([*arguments, ""]):
+        name, _, value = argument.partition("=")
+        if name == flag:
+            return value or following
+    return ""
 
 
 class _Processes:
@@ -384,7 +392,10 @@ def run_one(
 
 def _lists_photos(arguments: Sequence[str]) -> bool:
     """Whether a list, and no suffix, says which files are photos."""
-    return any(argument.split("=")[0] in ("--image-list", "--pipeline") for argument in arguments)
+    if _value_of("--image-list", arguments):
+        return True
+    pipeline = _value_of("--pipeline", arguments)
+    return bool(pipeline) and load_pipeline(Path(pipeline)).images.image_list is not None
 
 
 def _why(code: int, log: Path) -> str:

@@ -87,6 +87,20 @@ def test_scenes_at_a_time_share_the_cores_unless_told_otherwise(
     assert [path.read_text().split() for path in tmp_path.glob("stand-in.*")] == [given] * 3
 
 
+def test_an_empty_folder_is_passed_over_unless_a_list_names_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stand_in(tmp_path, monkeypatch, "exit 0")
+    monkeypatch.chdir(tmp_path)
+    root = collection(tmp_path, "a")
+    (root / "empty").mkdir()
+    Path("plain.toml").write_text("[run]\nseed = 3\n")
+    Path("list.toml").write_text("[images]\nimage_list = 'list.txt'\n")
+    for name, is_empty in (("plain.toml", True), ("list.toml", False)):
+        statuses = run_collection(root, tmp_path / "out", ["--pipeline", name])
+        assert {status.scene: status.empty for status in statuses} == {"a": False, "empty": is_empty}
+
+
 def test_the_statistics_are_the_numbers_of_the_reports_summary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

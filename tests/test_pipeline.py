@@ -385,6 +385,22 @@ def test_a_broken_link_is_an_unreadable_photo(workspace: Workspace, photos: Path
     assert outcome.num_items == 4
 
 
+@pytest.mark.parametrize("way", [{}, {"verify": True}, {"overwrite": True}])
+def test_damaged_features_are_mended_where_photos_may_be_left_out(tmp_path: Path, way: dict) -> None:
+    photos = tmp_path / "photos"
+    write_photos(photos, 3)
+    workspace = Workspace(tmp_path / "scene", create=True)
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(skip_unreadable=True), RUN)
+    config = cfg.FeaturesConfig(max_features=60)
+    pipeline.extract_features(workspace, config, RUN)
+    content = workspace.features.read_bytes()
+    workspace.features.write_bytes(content[:4096] + b"\xff" * 4096 + content[8192:])
+    run = dataclasses.replace(RUN, verify=way.get("verify", False))
+    pipeline.extract_features(workspace, config, run, overwrite=way.get("overwrite", False))
+    with features_of(workspace).reader() as read:
+        assert [len(read(name)) for name in read_index(workspace).names]
+
+
 @pytest.mark.parametrize("skip", [False, True])
 def test_features_are_of_the_photos_that_were_listed(tmp_path: Path, skip: bool) -> None:
     photos = tmp_path / "photos"

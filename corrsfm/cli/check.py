@@ -89,7 +89,9 @@ def check(
         except CorrsfmError as error:
             logger.warning("no forecast: %s", error)
     if keep is not None:
-        atomic_write_text(keep, "".join(f"{name}\n" for name in result.kept))
+        # A line that begins with a hash is a comment.
+        lines = (f"./{name}" if name.startswith("#") else name for name in result.kept)
+        atomic_write_text(keep, "".join(f"{line}\n" for line in lines))
     if as_json:
         echo_json({**result.to_dict(), "forecast": expected and expected.to_dict()})
     else:

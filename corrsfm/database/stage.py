@@ -132,6 +132,8 @@ def _damage(path: Path, *, thorough: bool) -> str:
 def fingerprint_of(workspace: Workspace, config: cfg.DatabaseConfig, seed: int) -> str:
     """What the record of the stage must carry to be current."""
     index = read_index(workspace)
+    mode = workspace.require("images").config["camera_mode"]
+    votes: list[Any] = [VOTES_VERSION] if _cameras_that_vote(workspace, index) else []
     return config_hash(
         "verified matches",
         pycolmap_version(),
@@ -140,7 +142,9 @@ def fingerprint_of(workspace: Workspace, config: cfg.DatabaseConfig, seed: int) 
         config,
         seed,
         # Where no camera votes, finished work of version 0.1.0 stays valid.
-        *([VOTES_VERSION] if _cameras_that_vote(workspace, index) else []),
+        *votes,
+        # Whether votes may part what shares a camera; of photos without EXIF the index says it not.
+        *([mode] if votes and mode != cfg.CameraMode.AUTO else []),
     )
 
 

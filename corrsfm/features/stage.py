@@ -29,7 +29,7 @@ from corrsfm.workspace.imported import (
     traits_to_come,
 )
 from corrsfm.workspace.lists import Index, read_index
-from corrsfm.workspace.resume import StageOutcome, complete, mark_left_out
+from corrsfm.workspace.resume import StageOutcome, complete, finished_or_mended, mark_left_out
 from corrsfm.workspace.shards import make_items
 from corrsfm.workspace.stores import features_of
 from corrsfm.workspace.warned import keeps_warnings
@@ -116,8 +116,8 @@ def extract_features(
 
     log = colmap_log(workspace.log) if config.extractor is cfg.Extractor.PYCOLMAP else nullcontext()
     with connected(run.cluster, run.workers) as cluster, log:
-        if may_skip:
-            left_out = [records[name] for name in sorted(store.finished(of_left_out))]
+        if may_skip and not overwrite:
+            left_out = [records[name] for name in sorted(finished_or_mended(store, of_left_out))]
             for name, result in work(workspace, left_out, run) if left_out else ():
                 if isinstance(result, ImageError):
                     logger.warning("left out: %s", result)

@@ -164,7 +164,9 @@ def add_photos(
         refuse_imported(scene)
         pending = pending_addition(scene)
         find_device(run.device)
-        found = make_readable(find_photos(photos, scene.images_dir), Path(scratch))
+        masks = cfg.from_dict(cfg.ImagesConfig, pending.options["images"], f"{scene.adding}: images").mask_dir
+        found = find_photos(photos, scene.images_dir, mask_dir=masks)
+        found = make_readable(found, Path(scratch))
         incoming, already = sort_out(found, scene, pending.photos)
         wanted = {**pending.photos, **{photo.name: photo.sha256 for photo in incoming}}
         if not wanted:

@@ -60,6 +60,8 @@ def pending_addition(workspace: Workspace) -> Pending:
         pending = Pending(**read_json(workspace.adding))
         if not _is_table(pending.photos, str) or not _is_table(pending.options, dict):
             raise TypeError("its photos or options are no tables")
+        if missing := STAGE_COMMANDS.keys() - pending.options.keys():
+            raise TypeError(f"lacks the options of {min(missing)}")
     except FileNotFoundError:
         workspace.require("models")
         # Photos are put into what is there, and cannot mend it; mapped again it would not be the same model.
@@ -131,7 +133,8 @@ def require_folder(workspace: Workspace, incoming: Sequence[Incoming], wanted: M
     lost = [name for name in wanted if name not in named and not (folder / name).is_file()]
     if lost:
         raise InputError(
-            f"{folder}: photos of the interrupted addition are not there: {first_few(lost)}; name them again"
+            f"{folder}: photos of the interrupted addition are not there: {first_few(lost)}; name them "
+            f"again, or give that addition up, with: {shlex.join(['rm', str(workspace.adding)])}"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ from corrsfm import config as cfg
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.pairs import read_verified_matches
-from corrsfm.files import atomic_path, atomic_write_json, read_json, replaced_name
+from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
 from corrsfm.reconstruction.calibration import adjustment_options, restore_priors
@@ -66,7 +65,6 @@ def grow_models(
     num_new_points : int
     """
     started = time.monotonic()
-    _restore_models(workspace)
     verified = workspace.require("verified matches")
     fingerprint = fingerprint_of(verified.fingerprint, config, run.seed)
     if workspace.is_current("models", fingerprint, workspace.sparse / "0", workspace.added):
@@ -159,13 +157,6 @@ def _judge(workspace: Workspace, model: pycolmap.Reconstruction, seed: int) -> N
         logger.debug("%s: says nothing of models that were joined", workspace.evidence)
     atomic_write_json(workspace.evidence, record)
     logger.info("verdict: %s", selection.verdict)
-
-
-def _restore_models(workspace: Workspace) -> None:
-    """Put the models back if an interruption came while their folder was replaced."""
-    aside = replaced_name(workspace.sparse)
-    if not workspace.sparse.exists() and aside.is_dir():
-        os.replace(aside, workspace.sparse)
 
 
 def _colour(model: pycolmap.Reconstruction, names: Mapping[str, Resection], folder: Path) -> None:

@@ -52,7 +52,9 @@ class Incoming:
     sha256: str
 
 
-def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
+def find_photos(
+    paths: PhotoPaths, images_dir: Path | None, *, mask_dir: Path | None = None
+) -> list[Incoming]:
     """The photos that paths name, sorted by name.
 
     A photo in the folder of the scene's photos keeps its name there. Any other is called by its path in the
@@ -63,6 +65,8 @@ def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
     paths : path or sequence of paths
     images_dir : Path or None
         Folder of the scene's photos; None if they do not join: then they are called by their paths.
+    mask_dir : Path, optional
+        A folder in which there are no photos.
 
     Raises
     ------
@@ -74,7 +78,7 @@ def find_photos(paths: PhotoPaths, images_dir: Path | None) -> list[Incoming]:
     found: dict[str, Incoming] = {}
     for path in given:
         if path.is_dir():
-            files = [(name, path / name) for name in list_images(path, at_least=1)]
+            files = [(name, path / name) for name in list_images(path, at_least=1, mask_dir=mask_dir)]
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             raise InputError(
                 f"{path}: is a video; take its frames with: corrsfm extract {shlex.quote(str(path))} FILM, "
@@ -128,8 +132,12 @@ def make_readable(photos: Sequence[Incoming], folder: Path) -> list[Incoming]:
 
 def name_in(file: Path, folder: Path) -> str:
     """Posix path of a file relative to a folder; empty if it lies elsewhere."""
-    place, root = file.resolve(), folder.resolve()
-    return place.relative_to(root).as_posix() if place.is_relative_to(root) else ""
+    root = folder.resolve()
+    # A link among the photos goes by its own name.
+    for place in (file.parent.resolve() / file.name, file.resolve()):
+        if place.is_relative_to(root):
+            return place.relative_to(root).as_posix()
+    return ""
 
 
 def refuse_imported(workspace: Workspace) -> None:

@@ -137,14 +137,8 @@ def import_features(
         opened = open_hloc(files.features, files.matches)
     else:
         opened = open_database(Path(str(files.database)), with_matches=with_matches)
-    is_new = not folder.exists()
-    try:
-        with opened as source:
-            return _import(source, files, Path(photos), folder, images, overwrite)
-    except BaseException:
-        if is_new:
-            shutil.rmtree(folder, ignore_errors=True)
-        raise
+    with opened as source:
+        return _import(source, files, Path(photos), folder, images, overwrite)
 
 
 def _absolute(path: Path | str | None) -> Path | None:
@@ -166,10 +160,16 @@ def _import(
                 f"{workspace.features}: is there already; choose another folder, or add --overwrite to "
                 "replace these features and what was made from them"
             )
-        index_photos(workspace, photos, images, cfg.RunConfig())
-        index = read_index(workspace)
-        _check_names(source, photos, index, may_have_more=images.image_list is not None)
-        return _write(source, files, workspace, index)
+        try:
+            index_photos(workspace, photos, images, cfg.RunConfig())
+            index = read_index(workspace)
+            _check_names(source, photos, index, may_have_more=images.image_list is not None)
+            return _write(source, files, workspace, index)
+        except BaseException:
+            # Only under its lock: another import may have begun there in the meantime.
+            if workspace.made_its_folder:
+                shutil.rmtree(folder, ignore_errors=True)
+            raise
 
 
 def _check_names(source: Source, photos: Path, index: Index, *, may_have_more: bool) -> None:

@@ -7,6 +7,7 @@ must come to an end.
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import stat
 from collections.abc import Collection
@@ -16,6 +17,8 @@ from corrsfm.disk import opening
 from corrsfm.errors import WorkspaceError
 
 __all__ = ["check_entries"]
+
+_SIDE_FILE = re.compile(r"\.db-(wal|shm|journal)$")
 
 
 def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
@@ -41,7 +44,7 @@ def check_entries(root: Path, own: Collection[str], *, may_link: bool) -> None:
     with os.scandir(root) as entries:
         for entry in entries:
             # Beside a database, SQLite keeps its log.
-            of_database = entry.name if entry.name.endswith(".db") else entry.name.rpartition("-")[0]
+            of_database = _SIDE_FILE.sub(".db", entry.name)
             if own and of_database not in own and entry.name not in own:
                 continue
             mode = entry.stat(follow_symlinks=False).st_mode

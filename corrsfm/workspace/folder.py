@@ -20,7 +20,7 @@ from pathlib import Path
 from corrsfm import config as cfg
 from corrsfm.disk import why_not
 from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
-from corrsfm.files import OWN_RECORD
+from corrsfm.files import OWN_RECORD, replaced_name
 from corrsfm.workspace.entries import check_entries
 from corrsfm.workspace.lease import hold, holder_of
 from corrsfm.workspace.ledger import Ledger
@@ -104,6 +104,11 @@ class Workspace(Ledger):
         self._values = {"format_version": FORMAT_VERSION, "images_dir": None, "stages": {}}
         self._write()
 
+    @property
+    def made_its_folder(self) -> bool:
+        """Whether there was no such folder before this workspace was begun, by this process."""
+        return self._begun is not None and self.root in self._begun[1]
+
     @contextlib.contextmanager
     def lock(self, *, wait: bool = False) -> Iterator[None]:
         """Hold the workspace for this process; one that was begun with unusable input vanishes again.
@@ -123,6 +128,10 @@ class Workspace(Ledger):
             self._values = read_manifest(self.manifest)
             if self._values["format_version"] < FORMAT_VERSION:
                 self._convert()
+            # A kill came while other models took their place.
+            aside = replaced_name(self.sparse)
+            if aside.is_dir() and not self.sparse.exists():
+                os.replace(aside, self.sparse)
             try:
                 yield
             except (ConfigError, InputError):

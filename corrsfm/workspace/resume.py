@@ -6,6 +6,7 @@ is the set of its items; it is current when every item is there with the fingerp
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Set
@@ -34,6 +35,7 @@ __all__ = [
     "complete",
     "explain",
     "finish",
+    "finished_or_mended",
     "mark_left_out",
     "photos_left_out",
     "require_database",
@@ -145,6 +147,7 @@ def complete(
         elif merge_shards(workspace, store):
             finished = store.finished(wanted)
             missing = [key for key in wanted if key not in finished]
+            is_whole = False
         if finished:
             logger.info(
                 "%s: %d of %d up to date, %d to do", label_of(stage), len(finished), len(wanted), len(missing)
@@ -192,17 +195,27 @@ def _require_room(path: Path, share: float) -> None:
 
 def _finished(store: ItemStore[K, T], wanted: Mapping[K, str], fingerprint: str, *, verify: bool) -> Set[K]:
     """Keys of finished items; damaged ones are dropped from the store with a warning."""
-    lost = store.mend() if verify else []
+    if verify:
+        _mend(store)
+    else:
+        with contextlib.suppress(DamageError):
+            if store.seal() == fingerprint:
+                return wanted.keys()
+    return finished_or_mended(store, wanted)
+
+
+def finished_or_mended(store: ItemStore[K, T], wanted: Mapping[K, str]) -> Set[K]:
+    """As `ItemStore.finished`; of a damaged store what is whole, with a warning."""
     try:
-        if not verify and not lost and store.seal() == fingerprint:
-            return wanted.keys()
-        finished = store.finished(wanted)
+        return store.finished(wanted)
     except DamageError:
-        lost += store.mend()
-        finished = store.finished(wanted)
-    for what in lost:
+        _mend(store)
+        return store.finished(wanted)
+
+
+def _mend(store: ItemStore[K, T]) -> None:
+    for what in store.mend():
         logger.warning("%s", what)
-    return finished
 
 
 def finish(

@@ -61,6 +61,18 @@ def test_photos_with_a_camera_each_by_request_do_not_vote(workspace: Workspace) 
     assert index_as(workspace, cfg.CameraMode.AUTO) == [(0,)]
 
 
+def test_whether_cameras_may_be_parted_is_part_of_what_the_stage_is(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stage, "read_index", lambda _: INDEX)
+    found = {}
+    for mode in (cfg.CameraMode.AUTO, cfg.CameraMode.SINGLE, cfg.CameraMode.PER_FOLDER):
+        index_as(workspace, mode)
+        workspace.finish("pruned matches", StageRecord(fingerprint="p"))
+        found[stage.fingerprint_of(workspace, cfg.DatabaseConfig(), seed=0)] = mode
+    assert len(found) == 3
+
+
 def test_points_reach_the_votes_relative_to_the_principal_point(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch
 ) -> None:

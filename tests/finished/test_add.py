@@ -22,6 +22,7 @@ from corrsfm import config as cfg
 from corrsfm.colmap.models import poses_of
 from corrsfm.errors import CorrsfmError, ImageError, InputError, WorkspaceError
 from corrsfm.finished.add import add_photos
+from corrsfm.finished.incoming import find_photos
 from corrsfm.finished.integrity import find_damage
 from corrsfm.geometry import relative_pose, rotation_angle_deg
 from corrsfm.pipeline import run_scene
@@ -264,6 +265,31 @@ def test_an_interruption_while_models_are_replaced_loses_none(
     (scene.workspace / "sparse").rename(scene.workspace / ".sparse.corrsfm.old")
     result = add_photos(scene.workspace, run=RUN)
     assert [photo.model for photo in result.photos] == [0, 0]
+
+
+def test_a_run_after_such_an_interruption_finds_the_models(scene: SceneToGrow) -> None:
+    before = contents(scene.workspace / "sparse")
+    (scene.workspace / "sparse").rename(scene.workspace / ".sparse.corrsfm.old")
+    with Workspace(scene.workspace).lock():
+        assert contents(scene.workspace / "sparse") == before
+
+
+def test_masks_beside_the_photos_do_not_join(scene: SceneToGrow) -> None:
+    masks = scene.photos / "masks"
+    masks.mkdir()
+    for photo in scene.photos.glob("*.png"):
+        assert cv2.imwrite(str(masks / f"{photo.name}.png"), np.full((8, 8), 255, np.uint8))
+    found = find_photos(scene.photos, scene.photos, mask_dir=masks)
+    assert [photo.name for photo in found] == sorted(path.name for path in scene.photos.glob("*.png"))
+
+
+def test_a_photo_that_is_a_link_goes_by_its_own_name(tmp_path: Path) -> None:
+    (tmp_path / "photos" / "left").mkdir(parents=True)
+    (tmp_path / "elsewhere.jpg").write_bytes(b"photo")
+    (tmp_path / "photos" / "left" / "1.jpg").symlink_to(tmp_path / "elsewhere.jpg")
+    (tmp_path / "in.jpg").symlink_to(tmp_path / "photos" / "left" / "1.jpg")
+    (photo,) = find_photos(tmp_path / "photos" / "left" / "1.jpg", tmp_path / "photos")
+    assert photo.name == "left/1.jpg"
 
 
 def test_a_photo_exchanged_during_an_addition_is_named_and_nothing_is_made_of_it(

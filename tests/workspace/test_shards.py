@@ -131,6 +131,20 @@ def test_shards_that_a_killed_run_left_are_merged_by_the_next(workspace: Workspa
     assert not workspace.shards.exists()
 
 
+def test_shards_of_other_options_leave_a_finished_store_finished(workspace: Workspace, store: Any) -> None:
+    run_stage(workspace, store, OneByOne())
+    # Another method's store is the one that the record is about.
+    workspace.forget("pruned matches")
+    folder = shards_of(workspace, store)
+    folder.mkdir(parents=True, exist_ok=True)
+    other = dict.fromkeys(PAIRS[:2], "other options")
+    run = cfg.RunConfig(threads=3)
+    fill_shard(str(workspace.root.absolute()), str(folder), ".db", "pruned", work, list(other), other, run, 1)
+    run_stage(workspace, store, OneByOne())
+    check(store)
+    assert store.seal() is not None
+
+
 def test_when_all_is_made_again_no_shard_counts(workspace: Workspace, store: Any) -> None:
     run_stage(workspace, store, OneByOne())
     assert run_stage(workspace, store, OneByOne()).skipped
