@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import shlex
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -61,7 +62,7 @@ def find_model(folder: Path) -> Path:
             return folder / place
     raise InputError(
         f"{folder}: holds no COLMAP model (cameras and images, .bin or .txt) and no sparse/0, sparse or "
-        f"model with one; for a workspace run: corrsfm reconstruct {folder}"
+        f"model with one; for a workspace run: corrsfm reconstruct {shlex.quote(str(folder))}"
     )
 
 
@@ -251,10 +252,13 @@ def read_models(folder: Path) -> list[pycolmap.Reconstruction]:
             models.append(_read(path))
         except _UNREADABLE as error:
             raise WorkspaceError(
-                f"{path}: no readable COLMAP model; try: corrsfm reconstruct {folder.parent} --overwrite"
+                f"{path}: no readable COLMAP model; try: corrsfm reconstruct "
+                f"{shlex.quote(str(folder.parent))} --overwrite"
             ) from error
     if not models:
-        raise WorkspaceError(f"{folder}: holds no model; try: corrsfm reconstruct {folder.parent}")
+        raise WorkspaceError(
+            f"{folder}: holds no model; try: corrsfm reconstruct {shlex.quote(str(folder.parent))}"
+        )
     return models
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import shlex
 import tempfile
 import time
 from collections.abc import Collection, Mapping
@@ -172,7 +173,8 @@ def add_photos(
         if not wanted:
             if not already:
                 raise InputError(
-                    f"{scene.root}: no photos to add were named; try: corrsfm add {scene.root} NEW"
+                    f"{scene.root}: no photos to add were named; try: corrsfm add "
+                    f"{shlex.quote(str(scene.root))} NEW"
                 )
             summary, _ = summarise(scene)
             unregistered = {photo.name for photo in summary.missing}.intersection(already)

@@ -67,8 +67,8 @@ def pending_addition(workspace: Workspace) -> Pending:
         # Photos are put into what is there, and cannot mend it; mapped again it would not be the same model.
         if changed := workspace.changed_files("verified matches"):
             raise WorkspaceError(
-                f"{first_few(map(str, changed))}: not as it was written; corrsfm check {workspace.root} says "
-                "how it is made again"
+                f"{first_few(map(str, changed))}: not as it was written; corrsfm check "
+                f"{shlex.quote(str(workspace.root))} says how it is made again"
             ) from None
         return Pending(
             photos={}, options={stage: workspace.require(stage).config for stage in STAGE_COMMANDS}

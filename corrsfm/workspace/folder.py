@@ -81,7 +81,8 @@ class Workspace(Ledger):
             )
         if not create:
             raise WorkspaceError(
-                f"{self.root}: not a corrsfm workspace; make one with: corrsfm extract IMAGES {self.root}"
+                f"{self.root}: not a corrsfm workspace; make one with: corrsfm extract IMAGES "
+                f"{shlex.quote(str(self.root))}"
             )
         if self.root.exists() and not self.root.is_dir():
             raise WorkspaceError(f"{self.root}: is a file; expected a folder for the workspace")

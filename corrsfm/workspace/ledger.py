@@ -58,7 +58,8 @@ class Ledger(Layout):
         """
         if not self._values["images_dir"]:
             raise WorkspaceError(
-                f"{self.root}: no photos indexed yet; run: corrsfm extract IMAGES {self.root}"
+                f"{self.root}: no photos indexed yet; run: corrsfm extract IMAGES "
+                f"{shlex.quote(str(self.root))}"
             )
         # A folder inside the workspace moves with it.
         return self.root / self._values["images_dir"]
