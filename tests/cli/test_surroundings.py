@@ -103,6 +103,9 @@ def test_a_signal_ends_a_command_in_one_line_and_with_the_status_of_shells(
 ) -> None:
     code = (
         "import signal, time, corrsfm.cli.check\n"
+        # Whoever runs the tests in the background may ignore them.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"
         "from corrsfm.cli import main\n"
         "def check(*_):\n"
         "    import pycolmap\n"
