@@ -17,6 +17,7 @@ from photos import write_photos
 from corrsfm import batch
 from corrsfm.batch import SceneStatus, find_scenes, run_collection, run_one
 from corrsfm.cli import main
+from corrsfm.cli.batch import _with_absolute_paths
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.report import make_report
 
@@ -231,6 +232,18 @@ def test_words_that_no_run_would_take_are_refused_before_any_scene(
     result = CliRunner().invoke(main, ["batch", str(photos), str(output), *words])
     assert result.exit_code == 2 and text in result.stderr
     assert not output.exists()
+
+
+def test_workers_are_told_where_files_are(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("my.pt", "my.toml"):
+        Path(name).touch()
+    Path("masks").mkdir()
+    given = ("--model", "my.pt", "--pipeline=my.toml", "--mask-dir", "masks", "--method", "masks")
+    assert _with_absolute_paths((*given, "--model", "small-mutual", "--threads", "1")) == (
+        "--model", f"{tmp_path}/my.pt", f"--pipeline={tmp_path}/my.toml", "--mask-dir", f"{tmp_path}/masks",
+        "--method", "masks", "--model", "small-mutual", "--threads", "1",
+    )  # fmt: skip
 
 
 def test_a_pipeline_that_no_run_would_take_is_refused_before_any_scene(tmp_path: Path) -> None:

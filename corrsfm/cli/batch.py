@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from pathlib import Path
 
 import click
@@ -38,6 +40,8 @@ def batch(
 
     _check_arguments(run_arguments)
     click.get_current_context().meta[OVERWRITE_KEY] = "--overwrite" in run_arguments
+    if dask is not None:
+        run_arguments = _with_absolute_paths(run_arguments)
     statuses = run_collection(collection, output, run_arguments, jobs=jobs, dask=dask)
     if as_json:
         echo_json([status.__dict__ for status in statuses])
@@ -51,6 +55,23 @@ def batch(
         )
     if all(status.empty for status in statuses):
         raise click.ClickException(f"{collection}: no photos in any of {len(statuses)} folders")
+
+
+def _with_absolute_paths(run_arguments: tuple[str, ...]) -> tuple[str, ...]:
+    """Name files as a worker, whose current folder is another, finds them; names of what is no file stay."""
+    from corrsfm.cli.stages import run
+
+    of_files = {flag for option in run.params if option.type is PATH for flag in option.opts}
+    absolute = []
+    for before, argument in itertools.pairwise(["", *run_arguments]):
+        flag, is_joined, value = argument.partition("=")
+        if before in of_files and os.path.exists(argument):
+            absolute.append(os.path.abspath(argument))
+        elif is_joined and flag in of_files and os.path.exists(value):
+            absolute.append(f"{flag}={os.path.abspath(value)}")
+        else:
+            absolute.append(argument)
+    return tuple(absolute)
 
 
 def _check_arguments(run_arguments: tuple[str, ...]) -> None:
