@@ -91,6 +91,8 @@ def fit_to_gps(
         )
     centres = np.array([camera_centre(poses[name]) for name in names])
     geodetic = np.array([positions[name] for name in names], float)
+    # On both sides of the 180th meridian longitudes are numbers far apart.
+    geodetic[:, 1] = geodetic[0, 1] + np.remainder(geodetic[:, 1] - geodetic[0, 1] + 180.0, 360.0) - 180.0
     origin = np.median(geodetic, axis=0)
     targets = _east_north_up(geodetic, origin)
     if _extents(targets)[0] < _RESOLUTION_M:

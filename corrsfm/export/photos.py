@@ -174,11 +174,10 @@ def _pinhole_of(camera: pycolmap.Camera) -> pycolmap.Camera:
     if not camera.is_undistorted():
         return pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
     pinhole = pycolmap.Camera(camera.todict())
-    if pinhole.model_name == "SIMPLE_PINHOLE":
-        # OpenMVS reads PINHOLE only.
-        focal, cx, cy = pinhole.params
-        pinhole.model = pycolmap.CameraModelId.PINHOLE
-        pinhole.params = [focal, focal, cx, cy]
+    # Of whatever model: a distortion that is zero makes none of it PINHOLE, which is all that others read.
+    focal_lengths = [camera.focal_length_x, camera.focal_length_y]
+    pinhole.model = pycolmap.CameraModelId.PINHOLE
+    pinhole.params = [*focal_lengths, camera.principal_point_x, camera.principal_point_y]
     return pinhole
 
 

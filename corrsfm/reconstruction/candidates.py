@@ -157,7 +157,11 @@ def map_candidate(
     """
     finished = workdir / "candidate.json"
     if finished.exists():
-        return pycolmap.Reconstruction(workdir / "model") if (workdir / "model").is_dir() else None
+        if not (workdir / "model").is_dir():
+            return None
+        known = pycolmap.Reconstruction(workdir / "model")
+        restore_priors(known, database)
+        return known
     if not database.is_file():
         raise DatabaseError(f"{database}: no such database; try: corrsfm prune WORKSPACE")
     shutil.rmtree(workdir, ignore_errors=True)

@@ -100,10 +100,11 @@ def grow(
         try:
             while len(registered) < len(wanted):
                 attempts = _attempts(grown, matches, registered, known_focal, seed)
-                name, best = max(attempts.items(), key=lambda item: (item[1].num_inliers, item[0]))
-                if best.pose is None:
+                placed = {name: one for name, one in attempts.items() if one.pose is not None}
+                if not placed:
                     failed = attempts
                     break
+                name, best = max(placed.items(), key=lambda item: (item[1].num_inliers, item[0]))
                 _place(grown, mapper, name, best, seed)
                 registered[name] = best
             if registered:

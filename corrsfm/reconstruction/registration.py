@@ -15,6 +15,7 @@ import pycolmap
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import copy_database, database_errors
+from corrsfm.reconstruction.calibration import restore_priors
 from corrsfm.reconstruction.candidates import (
     Candidate,
     MapperKind,
@@ -73,6 +74,7 @@ def register_again(
             rest.deregister_frame(image.frame_id)
     if rest.num_reg_images() < 2:
         return None
+    original = database
     # What a kill has left of an earlier attempt.
     shutil.rmtree(workdir, ignore_errors=True)
     given, found = workdir / "given", workdir / "found"
@@ -95,4 +97,5 @@ def register_again(
     kept = {image.name for image in rest.images.values() if image.has_pose}
     if again is None or not kept <= {image.name for image in again.images.values() if image.has_pose}:
         return None
+    restore_priors(again, original)
     return again

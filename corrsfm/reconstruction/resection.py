@@ -156,6 +156,11 @@ class Resection:
                 f"its {self.num_matches} matches lead to {self.num_candidates} points of the model, "
                 f"{FEWEST_INLIERS} are needed"
             )
+        if self.num_inliers >= FEWEST_INLIERS:
+            return (
+                f"{self.num_inliers} of {self.num_candidates} points of the model agree with one pose, but "
+                "of a focal length that no camera has"
+            )
         return (
             f"{self.num_inliers} of {self.num_candidates} points of the model agree with one pose, "
             f"{FEWEST_INLIERS} are needed"

@@ -110,7 +110,7 @@ def without_side_channels(network: CorrAdaptor, num_left: int, neutral: Sequence
     num_left : int
         Side channels to keep, counted from the first.
     neutral : sequence of float
-        Value of each side channel of the network where nothing is known.
+        Value of each side channel, also of ones that the network lacks, where nothing is known.
 
     Returns
     -------
@@ -120,7 +120,7 @@ def without_side_channels(network: CorrAdaptor, num_left: int, neutral: Sequence
     narrow = CorrAdaptor.from_config(dataclasses.replace(network.config, side_channels=num_left))
     narrow.usage = network.usage
     state = network.state_dict()
-    dropped = torch.tensor(neutral[num_left:])
+    dropped = torch.tensor(neutral[num_left : network.config.side_channels])
     for block in range(len(network.blocks)):
         # Side channels are the last columns of a block's input.
         weight, bias = f"blocks.{block}.stem.weight", f"blocks.{block}.stem.bias"

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from statistics import fmean
 from typing import Any, cast
 
 import torch
@@ -191,18 +192,17 @@ class Trainer:
         clock = time.process_time if self.config.processor_time else time.monotonic
         started = clock() - 60.0 * self.minutes
         last = {"log": self.minutes, "save": self.minutes, "validate": self.minutes}
-        sums: dict[str, float] = {}
-        num_steps = 0
+        since: dict[str, list[float]] = {}
         while (progress := self._agreed_progress()) < 1.0:
             losses = self.train_step(progress)
             self.minutes = (clock() - started) / 60.0
             for name, value in losses.items():
-                sums[name] = sums.get(name, 0.0) + value
-            num_steps += 1
+                since.setdefault(name, []).append(value)
             # Steps may be slow: log at least once a minute.
             if self.step % self.config.log_every == 0 or self.minutes - last["log"] >= 1.0:
-                self._log({name: value / num_steps for name, value in sums.items()}, progress)
-                sums, num_steps = {}, 0
+                # Steps that were skipped, or lack a term, have no part in its mean.
+                self._log({name: fmean(values) for name, values in since.items()}, progress)
+                since = {}
                 last["log"] = self.minutes
             if self.rank == 0 and self.minutes - last["save"] >= self.config.checkpoint_minutes:
                 self.save()

@@ -69,6 +69,18 @@ def test_cameras_come_to_lie_where_they_were(is_upright: bool) -> None:
     np.testing.assert_allclose(found - found.mean(axis=0), enu - enu.mean(axis=0), atol=2e-3)
 
 
+@pytest.mark.parametrize("is_upright", [False, True])
+def test_cameras_on_both_sides_of_the_180th_meridian(
+    monkeypatch: pytest.MonkeyPatch, is_upright: bool
+) -> None:
+    monkeypatch.setitem(globals(), "ORIGIN", (-17.0, 180.0, 20.0))
+    enu = flight()
+    longitudes = {position[1] for position in geodetic(enu).values()}
+    assert min(longitudes) < -179.9 and max(longitudes) > 179.9
+    found = placed(enu, is_upright=is_upright)
+    np.testing.assert_allclose(found - found.mean(axis=0), enu - enu.mean(axis=0), atol=2e-3)
+
+
 def test_wrong_positions_do_not_move_the_model() -> None:
     enu = flight()
     noise = np.random.default_rng(2).normal(0, 1.0, enu.shape)

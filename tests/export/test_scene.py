@@ -14,7 +14,7 @@ from finished_scene import CAMERAS, FinishedScene, make_finished_scene
 from corrsfm import export_scene
 from corrsfm.errors import DatabaseError, InputError, WorkspaceError
 from corrsfm.export import ExportTarget
-from corrsfm.export.photos import flat_names, is_undistortable
+from corrsfm.export.photos import _pinhole_of, flat_names, is_undistortable
 from corrsfm.workspace import StageRecord, Workspace
 
 
@@ -249,3 +249,19 @@ def test_every_target_is_written_by_its_function(radial_scene: FinishedScene, tm
         result = export_scene(radial_scene.workspace, tmp_path / target, target)
         assert result.target is target and (tmp_path / target).exists()
     assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [700.0, 400.0, 300.0]),
+        ("SIMPLE_RADIAL", [700.0, 400.0, 300.0, 0.0]),
+        ("RADIAL", [700.0, 400.0, 300.0, 0.0, 0.0]),
+        ("OPENCV", [700.0, 700.0, 400.0, 300.0, 0.0, 0.0, 0.0, 0.0]),
+    ],
+)
+def test_cameras_without_distortion_are_pinholes_whatever_their_model(
+    model: str, params: list[float]
+) -> None:
+    pinhole = _pinhole_of(pycolmap.Camera(model=model, width=800, height=600, params=params))
+    assert pinhole.model_name == "PINHOLE" and pinhole.params.tolist() == [700.0, 700.0, 400.0, 300.0]

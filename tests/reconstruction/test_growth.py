@@ -1,12 +1,15 @@
 """Photos put into a finished model by its points: where they belong, and nothing else moves."""
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
 from synthetic_database import synthesize
 
+import corrsfm.reconstruction.growth as growth_module
 from corrsfm.colmap.cameras import camera_from_pycolmap
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
@@ -42,6 +45,31 @@ def test_photos_find_their_places_and_the_others_stay(known: bool, tmp_path: Pat
     after = {name: image.cam_from_world().matrix() for name, image in _images(growth.model).items()}
     assert all((after[name] == pose).all() for name, pose in before.items())
     assert growth.model.num_reg_images() == 8 and model.num_reg_images() == 6
+
+
+def test_a_photo_that_is_refused_does_not_keep_others_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truth = synthesize(tmp_path / "d.db")
+    names = sorted(views_of(truth))
+    odd, new = names[2], [names[2], names[6]]
+    tried = growth_module._attempts
+
+    def attempts(*arguments: Any) -> dict[str, Any]:
+        found = tried(*arguments)
+        return {
+            name: dataclasses.replace(one, pose=None) if name == odd else one for name, one in found.items()
+        }
+
+    monkeypatch.setattr(growth_module, "_attempts", attempts)
+    growth = grow(
+        without(truth, new, tmp_path / "rest"), new, tmp_path / "d.db",
+        read_verified_matches(tmp_path / "d.db"), known_focal=dict.fromkeys(new, True),
+    )  # fmt: skip
+    assert list(growth.registered) == [names[6]] and list(growth.failed) == [odd]
+    assert growth.failed[odd].why_not.endswith(
+        "agree with one pose, but of a focal length that no camera has"
+    )
 
 
 def test_a_model_with_other_cameras_than_the_database_grows_too(tmp_path: Path) -> None:

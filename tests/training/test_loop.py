@@ -12,9 +12,10 @@ from labelled_scene import make_scene
 from corrsfm.config import MatchInput
 from corrsfm.errors import CheckpointError, ConfigError, WorkspaceError
 from corrsfm.labelled.compact import write_scenes
-from corrsfm.model import load_network, read_provenance, save_network
+from corrsfm.model import build_network, load_network, read_provenance, save_network
+from corrsfm.prune.correspondences import NEUTRAL_CHANNELS
 from corrsfm.training import loop
-from corrsfm.training.checkpoint import load_state
+from corrsfm.training.checkpoint import load_state, without_side_channels
 from corrsfm.training.config import AugmentConfig, Schedule, TrainConfig, TrainRecipe
 from corrsfm.training.dataset import RealPairs, generator_for
 from corrsfm.training.initial import network_config
@@ -190,6 +191,13 @@ def test_a_run_starts_from_the_weights_of_a_checkpoint(data, tmp_path):
 def test_a_network_that_pruning_could_not_feed_is_refused():
     with pytest.raises(ConfigError, match=r"side_channels is 3, expected one of \[0, 2, 5\]"):
         network_config(TrainRecipe(network={**TINY, "side_channels": 3}))
+
+
+@pytest.mark.parametrize(("before", "left"), [(5, 2), (5, 0), (2, 0)])
+def test_a_network_goes_on_without_its_last_side_channels(before, left):
+    network = build_network(network_config(TrainRecipe(network={**TINY, "side_channels": before})))
+    narrow = without_side_channels(network, left, NEUTRAL_CHANNELS)
+    assert narrow.config.side_channels == left
 
 
 def test_resuming_another_network_is_refused(data, tmp_path):
