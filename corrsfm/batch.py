@@ -275,7 +275,7 @@ def _status_of(scene: str, outcome: SceneStatus | Exception) -> SceneStatus:
 
 def _threads_argument(arguments: Sequence[str], jobs: int) -> list[str]:
     """Arguments that give each concurrent scene its share of the cores, unless the user chose."""
-    if jobs == 1 or any(argument.split("=")[0] == "--threads" for argument in arguments):
+    if jobs == 1 or _value_of("--threads", arguments):
         return []
     pipeline = _value_of("--pipeline", arguments)
     if pipeline and load_pipeline(Path(pipeline)).run.threads:

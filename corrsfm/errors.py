@@ -35,6 +35,7 @@ __all__ = [
     "ReconstructionError",
     "WorkspaceError",
     "first_few",
+    "lack_or_text",
     "printable",
 ]
 
@@ -110,6 +111,11 @@ def first_few(names: Iterable[str]) -> str:
     names = list(names)
     rest = len(names) - _MAX_NAMED
     return ", ".join(names[:_MAX_NAMED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def lack_or_text(error: Exception) -> str:
+    """What an error says of values that were read, where Python's says of a missing one its name alone."""
+    return f"lacks {error}" if isinstance(error, KeyError) else str(error)
 
 
 def printable(text: str) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.errors import InputError
+from corrsfm.errors import InputError, lack_or_text
 from corrsfm.evaluation.metrics import POSE_THRESHOLDS_DEG, Interval, auc_contributions, bootstrap_mean
 from corrsfm.files import atomic_write_text, read_text
 from corrsfm.machine import count_threads, versions
@@ -165,9 +165,8 @@ def kept_methods(
                 raise TypeError("a fingerprint is no text")
             read(entry)
     except (KeyError, TypeError, ValueError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else error
         raise InputError(
-            f"{results}: damaged ({what}); use --overwrite to measure again, or another file"
+            f"{results}: damaged ({lack_or_text(error)}); use --overwrite to measure again, or another file"
         ) from error
     return methods
 

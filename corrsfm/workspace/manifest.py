@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from corrsfm.disk import explain
-from corrsfm.errors import WorkspaceError
+from corrsfm.errors import WorkspaceError, lack_or_text
 from corrsfm.files import atomic_write_json, read_json
 
 __all__ = ["FORMAT_VERSION", "StageRecord", "has_lost_manifest", "read_manifest", "write_manifest"]
@@ -100,9 +100,9 @@ def read_manifest(path: Path) -> dict[str, Any]:
     except PermissionError as error:
         raise WorkspaceError(explain(error)) from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        if isinstance(error, KeyError | TypeError | AttributeError):
-            reason = f"lacks {error}" if isinstance(error, KeyError) else "not what a workspace records"
+        reason = error.strerror if isinstance(error, OSError) else lack_or_text(error)
+        if isinstance(error, TypeError | AttributeError):
+            reason = "not what a workspace records"
         raise WorkspaceError(
             f"{path}: damaged ({reason}); remove it alone, with: {shlex.join(['rm', '-r', str(path)])}; then "
             "run the commands of the workspace again, finished features and matches are kept"

@@ -126,6 +126,12 @@ def test_a_signal_ends_a_command_in_one_line_and_with_the_status_of_shells(
     assert process.returncode == 128 + number
 
 
+def run_code(code: str, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, cwd=folder
+    )
+
+
 def test_an_interrupted_import_is_not_taken_for_a_missing_package(tmp_path: Path) -> None:
     code = (
         "import os, signal\n"
@@ -139,7 +145,7 @@ def test_an_interrupted_import_is_not_taken_for_a_missing_package(tmp_path: Path
         "main.commands['check'].callback = check\n"
         "main(['check', 'photos'], prog_name='corrsfm')\n"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
+    result = run_code(code)
     assert (result.returncode, result.stderr.splitlines()) == (
         130, ["Error: interrupted; run the same command again to go on"],
     )  # fmt: skip
@@ -162,7 +168,7 @@ def test_a_background_job_that_is_terminated_while_it_imports_says_so(tmp_path: 
         "main.commands['check'].callback = check\n"
         "main(['check', 'photos'], prog_name='corrsfm')\n"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
+    result = run_code(code)
     assert (result.returncode, result.stderr.splitlines()) == (
         143, ["Error: terminated; run the same command again to go on"],
     )  # fmt: skip
@@ -186,9 +192,7 @@ def test_a_terminated_batch_says_so_whatever_its_scenes_do(tmp_path: Path) -> No
         "threading.Thread(target=terminate, daemon=True).start()\n"
         "main(['--quiet', 'batch', 'photos', 'out'], prog_name='corrsfm')\n"
     )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT, cwd=tmp_path
-    )
+    result = run_code(code, tmp_path)
     assert result.returncode == 143
     assert result.stderr.splitlines()[-1].startswith("Error: terminated; ")
 
@@ -203,5 +207,5 @@ def test_a_command_that_is_still_being_loaded_ends_without_a_word(tmp_path: Path
         "sys.meta_path.insert(0, Finder)\n"
         "corrsfm.__main__.main()\n"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
+    result = run_code(code)
     assert (result.returncode, result.stderr) == (130, "")

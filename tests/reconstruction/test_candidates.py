@@ -93,13 +93,18 @@ def test_photos_of_a_shared_camera_get_one_each_and_share_one_again(
     assert {image.camera_id for image in shared.images.values()} == {1}
 
 
-def test_cameras_of_known_focal_length_are_not_on_trial(tmp_path: Path) -> None:
-    path = tmp_path / "database.db"
+def synthesize_with_known_focal_length(folder: Path) -> Path:
+    path = folder / "database.db"
     synthesize(path)
     with pycolmap.Database.open(path) as database:
         (camera,) = database.read_all_cameras()
         camera.has_prior_focal_length = True
         database.update_camera(camera)
+    return path
+
+
+def test_cameras_of_known_focal_length_are_not_on_trial(tmp_path: Path) -> None:
+    path = synthesize_with_known_focal_length(tmp_path)
     assert find_cameras_on_trial(path) is None
     for to in (StartingCameras.SEPARATE, StartingCameras.SHARED):
         change_cameras(path, to)
@@ -121,12 +126,7 @@ def test_equal_candidates_give_equal_models(tmp_path: Path) -> None:
 
 
 def test_a_finished_candidate_is_read_and_not_mapped_again(tmp_path: Path) -> None:
-    path = tmp_path / "database.db"
-    synthesize(path)
-    with pycolmap.Database.open(path) as database:
-        (camera,) = database.read_all_cameras()
-        camera.has_prior_focal_length = True
-        database.update_camera(camera)
+    path = synthesize_with_known_focal_length(tmp_path)
     candidate = Candidate(mapper=MapperKind.INCREMENTAL)
     first = map_candidate(candidate, path, tmp_path / "candidate")
     finished = (tmp_path / "candidate/candidate.json").read_text()

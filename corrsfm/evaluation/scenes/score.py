@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from corrsfm.errors import InputError
+from corrsfm.errors import InputError, lack_or_text
 from corrsfm.evaluation.metrics import pose_auc, position_errors, relative_pose_errors
 from corrsfm.files import read_json
 from corrsfm.geometry import Pose, camera_centre
@@ -172,10 +172,9 @@ def _read_camera(path: Path) -> Pose:
         rotation = np.array(values["rotation"], np.float64).reshape(3, 3)
         translation = np.array(values["translation"], np.float64).reshape(3)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else error
         raise InputError(
-            f"{path}: not a camera file ({what}); expected 'rotation' (3 × 3) and 'translation' (3) of "
-            "cam_from_world"
+            f"{path}: not a camera file ({lack_or_text(error)}); expected 'rotation' (3 × 3) and "
+            "'translation' (3) of cam_from_world"
         ) from error
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise InputError(f"{path}: 'rotation' is not a rotation matrix; expected cam_from_world, rows first")

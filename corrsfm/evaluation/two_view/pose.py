@@ -150,15 +150,17 @@ def score_pairs(
     on_progress : callable
         Called with the number of pairs just done.
     """
+
+    def outputs_of(some: Sequence[OANetPair]) -> list[list[MethodOutput]]:
+        kept = methods[0].keep(some)
+        return [method.estimate(some, *kept, seed=seed) for method in methods]
+
     # Libraries load and compile on first use, which is not the method's time.
-    for method in methods:
-        method(pairs[:1], seed=seed)
+    outputs_of(pairs[:1])
     rows: list[list[dict[str, float]]] = [[] for _ in methods]
     for start in range(0, len(pairs), _BATCH):
         batch = pairs[start : start + _BATCH]
-        kept = methods[0].keep(batch)
-        for method, own in zip(methods, rows, strict=True):
-            outputs = method.estimate(batch, *kept, seed=seed)
+        for own, outputs in zip(rows, outputs_of(batch), strict=True):
             own.extend(_score_one(pair, output) for pair, output in zip(batch, outputs, strict=True))
         on_progress(len(batch))
     return [PairScores(**{name: np.array([row[name] for row in own]) for name in _PER_PAIR}) for own in rows]
