@@ -22,6 +22,7 @@ from corrsfm.report.stage import summarise
 from corrsfm.report.statistics import SceneReport
 from corrsfm.types import PairStatistics
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.last_run import seed_of_last_run
 from corrsfm.workspace.lists import read_index
 
 __all__ = ["Bridge", "HeldPhoto", "SceneFinding", "WorkspaceCheck", "check_workspace"]
@@ -330,6 +331,9 @@ def _verdict(report: SceneReport, workspace: Workspace) -> list[SceneFinding]:
     if "--max-models-tried" in advice:
         tried = int(report.configuration.get("models", {}).get("max_models_tried", 24))
         step = command_again(workspace, "models", "--max-models-tried", str(2 * tried))
+    elif "--seed" in advice:
+        seed = seed_of_last_run(workspace) or 0
+        step = command_again(workspace, "models", "--seed", str(seed + 1))
     elif "--camera-mode single" in advice:
         step = command_again(workspace, "images", "--camera-mode", "single")
     text = f"the model is {verdict['grade']}: {'; '.join(verdict['reasons'])}"

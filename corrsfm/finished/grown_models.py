@@ -18,7 +18,7 @@ from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
-from corrsfm.reconstruction.calibration import adjustment_options, restore_priors
+from corrsfm.reconstruction.calibration import Refinement, adjustment_options, restore_priors
 from corrsfm.reconstruction.growth import grow
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.resection import Resection
@@ -80,11 +80,7 @@ def grow_models(
         for record in index.records
     }
     num_threads = count_threads(run.threads)
-    refinement = adjustment_options(
-        intrinsics=config.refine_intrinsics,
-        principal_point=config.refine_principal_point,
-        num_threads=num_threads,
-    )
+    refinement = adjustment_options(Refinement.of(config), num_threads=num_threads)
     placed: dict[str, tuple[int, Resection]] = {}
     last: dict[str, Resection] = {}
     num_new_points = 0

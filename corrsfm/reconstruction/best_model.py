@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
-from corrsfm.reconstruction.calibration import describe_impossible, has_prior_focal_lengths
+from corrsfm.reconstruction.calibration import (
+    DEFAULT_REFINEMENT,
+    Refinement,
+    describe_impossible,
+    has_prior_focal_lengths,
+)
 from corrsfm.reconstruction.candidates import (
     Candidate,
     MapperKind,
@@ -26,7 +31,7 @@ from corrsfm.reconstruction.candidates import (
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
 from corrsfm.reconstruction.epipolar import TwoViews
 from corrsfm.reconstruction.explained import Explained, explain, is_explained
-from corrsfm.reconstruction.focal_slack import FocalSlack, measure_focal_slack
+from corrsfm.reconstruction.focal_slack import measure_focal_slack
 from corrsfm.reconstruction.folds.evidence import FoldEvidence
 from corrsfm.reconstruction.folds.unfold import (
     Attempt,
@@ -153,7 +158,7 @@ def select_model(
     first_seconds: float,
     seed: int = 0,
     cameras_on_trial: StartingCameras | None = None,
-    refine_principal_point: bool = False,
+    refinement: Refinement = DEFAULT_REFINEMENT,
     num_processes: int = 1,
     unfold: bool = True,
 ) -> Selection | None:
@@ -179,7 +184,8 @@ def select_model(
         Of the first model.
     cameras_on_trial : StartingCameras, optional
         Other cameras to try as well, see `corrsfm.reconstruction.candidates.find_cameras_on_trial`.
-    refine_principal_point : bool
+    refinement : Refinement
+        The same for every candidate as for the first model.
     num_processes : int
         Candidates mapped at a time; the choice does not depend on it.
     unfold : bool
@@ -210,12 +216,12 @@ def select_model(
             has_more_cameras=has_more_cameras,
         )
 
-    bank = candidate_bank(seed=seed, on_trial=cameras_on_trial)
+    bank = candidate_bank(seed=seed, on_trial=cameras_on_trial, refinement=refinement)
     cameras_of = {candidate.name: candidate.cameras for candidate in bank}
     with CandidatePool(
         database,
         workdir,
-        refine_principal_point=refine_principal_point,
+        refinement=refinement,
         num_processes=num_processes,
         max_runtime_seconds=round(policy.max_time_factor * first_seconds) + 1,
     ) as pool:
@@ -242,7 +248,7 @@ def select_model(
                 workdir / "again",
                 cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
                 seed=seed,
-                refine_principal_point=refine_principal_point,
+                refinement=refinement,
             )
             if again is None:
                 return None
@@ -251,26 +257,29 @@ def select_model(
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
             return tried(name, again, first_seconds, has_more_cameras=model.has_more_cameras)
 
-        start = None
+        start, others = None, []
         if first is not None:
             start = tried(FIRST, first, first_seconds)
             # Fewer focal lengths may be found where many are open; the other candidates leave them as open.
             if cameras_on_trial is StartingCameras.SHARED:
-                slack = _focal_slack(first)
+                slack = measure_focal_slack(first)
                 start = dataclasses.replace(start, is_open=slack is not None and slack.is_large)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
-            start = next((outcome for outcome in map_round(candidates) if outcome is not None), None)
+            others = map_round(candidates)
+            start = next((outcome for outcome in others if outcome is not None), None)
+            others = [outcome for outcome in others if outcome is not start]
         if start is None:
             return None
         attempt = judge_model(models[start.name], evidence.verified)
         if unfold:
-            best = _unfolded(attempt, evidence, database, workdir, seed)
+            best = _unfolded(attempt, evidence, database, workdir, seed, refinement)
             if best is not attempt:
                 return _selection_of(best, start, evidence, first_seconds)
         choice = choose_model(
             start,
             bank,
+            others=others,
             num_photos=len(evidence.names),
             map_round=map_round,
             count_predicted=evidence.count_predicted,
@@ -288,7 +297,14 @@ def select_model(
     )
 
 
-def _unfolded(first: Attempt, evidence: SceneEvidence, database: Path, workdir: Path, seed: int) -> Attempt:
+def _unfolded(
+    first: Attempt,
+    evidence: SceneEvidence,
+    database: Path,
+    workdir: Path,
+    seed: int,
+    refinement: Refinement,
+) -> Attempt:
     """The best model without pairs that fold the first one; or the first one.
 
     Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
@@ -296,14 +312,14 @@ def _unfolded(first: Attempt, evidence: SceneEvidence, database: Path, workdir: 
     attempts = try_unfolding(
         first,
         evidence.verified,
-        lambda removed: _map_without(removed, database, workdir / "unfolded", seed),
+        lambda removed: _map_without(removed, database, workdir / "unfolded", seed, refinement),
         rules=tuple(UnfoldRule) if first.evidence.folded else (UnfoldRule.VOTES,),
     )
     return best_unfolding(first, attempts)
 
 
 def _map_without(
-    removed: Sequence[Pair], database: Path, workdir: Path, seed: int
+    removed: Sequence[Pair], database: Path, workdir: Path, seed: int, refinement: Refinement
 ) -> pycolmap.Reconstruction | None:
     """The model of the verified pairs without some of them."""
     shutil.rmtree(workdir, ignore_errors=True)
@@ -314,7 +330,8 @@ def _map_without(
         ids = {image.name: image.image_id for image in tables.read_all_images()}
         for name0, name1 in removed:
             tables.delete_two_view_geometry(ids[name0], ids[name1])
-    return map_candidate(Candidate(mapper=MapperKind.INCREMENTAL, seed=seed), copy, workdir / "model")
+    candidate = Candidate(mapper=MapperKind.INCREMENTAL, seed=seed)
+    return map_candidate(candidate, copy, workdir / "model", refinement=refinement)
 
 
 def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first_seconds: float) -> Selection:
@@ -364,11 +381,6 @@ def judge_as_it_is(
     )
 
 
-def _focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
-    """What other focal lengths would change; None where none is open."""
-    return None if has_prior_focal_lengths(model) else measure_focal_slack(model)
-
-
 def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, folds: FoldEvidence) -> Verdict:
     points = np.array([point.xyz for point in model.points3D.values()], np.float64).reshape(-1, 3)
     return judge(
@@ -376,9 +388,10 @@ def _verdict(model: pycolmap.Reconstruction, choice: Choice, num_photos: int, fo
             num_photos=num_photos,
             explained=choice.chosen.explained,
             support=choice.support,
+            could_try_more=choice.could_try_more,
             implausible_intrinsics=describe_impossible(model),
             has_prior_focal_lengths=has_prior_focal_lengths(model),
-            focal_slack=_focal_slack(model),
+            focal_slack=measure_focal_slack(model),
             lens_misfit=measure_lens_misfit(model),
             thickness=thickness(points),
             is_folded=folds.folded,

@@ -8,6 +8,8 @@ photos to judge by, avoids that.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,11 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.sqlite import open_for_reading
+from corrsfm.config import ReconstructionConfig
 
 __all__ = [
+    "DEFAULT_REFINEMENT",
+    "Refinement",
     "adjust",
     "adjusted_cost",
     "adjustment_options",
@@ -42,6 +47,29 @@ _MAX_ERROR_PX, _MIN_ANGLE_DEG = 4.0, 1.5
 
 # More points do not change the ratio of two costs, but take time.
 _NUM_POINTS, _NUM_POINTS_PER_PHOTO = 1000, 40
+
+
+@dataclass(frozen=True, kw_only=True)
+class Refinement:
+    """Which intrinsics mapping may change.
+
+    Attributes
+    ----------
+    intrinsics : bool
+        Focal lengths and distortion.
+    principal_point : bool
+    """
+
+    intrinsics: bool = True
+    principal_point: bool = False
+
+    @classmethod
+    def of(cls, config: ReconstructionConfig) -> Refinement:
+        """What the options of a stage say."""
+        return cls(intrinsics=config.refine_intrinsics, principal_point=config.refine_principal_point)
+
+
+DEFAULT_REFINEMENT = Refinement()
 
 
 def focal_length_ratios(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
@@ -107,38 +135,35 @@ def has_prior_focal_lengths(model: pycolmap.Reconstruction) -> bool:
 
 
 def refine_intrinsics(
-    model: pycolmap.Reconstruction, *, refine_principal_point: bool = False, num_threads: int = 0
+    model: pycolmap.Reconstruction, refinement: Refinement = DEFAULT_REFINEMENT, *, num_threads: int = 0
 ) -> None:
-    """Refine a model, focal lengths and distortion included, and drop the points that no longer fit.
+    """Refine a whole model and drop the points that no longer fit.
 
     Parameters
     ----------
     model : pycolmap.Reconstruction
         Changed in place.
-    refine_principal_point : bool
+    refinement : Refinement
     num_threads : int
         0 for all cores.
     """
-    options = adjustment_options(principal_point=refine_principal_point, num_threads=num_threads)
-    refine(model, options)
+    refine(model, adjustment_options(refinement, num_threads=num_threads))
 
 
 def adjustment_options(
-    *, intrinsics: bool = True, principal_point: bool = False, num_threads: int = 1
+    refinement: Refinement = DEFAULT_REFINEMENT, *, num_threads: int = 1
 ) -> pycolmap.BundleAdjustmentOptions:
     """How a whole model is adjusted: what mapping left alone stays.
 
     Parameters
     ----------
-    intrinsics : bool
-        Whether focal lengths and distortion may change.
-    principal_point : bool
+    refinement : Refinement
     num_threads : int
         0 for all cores.
     """
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_focal_length = options.refine_extra_params = intrinsics
-    options.refine_principal_point = principal_point
+    options.refine_focal_length = options.refine_extra_params = refinement.intrinsics
+    options.refine_principal_point = refinement.principal_point
     options.ceres.solver_options.num_threads = num_threads or -1
     return options
 
@@ -161,12 +186,15 @@ def adjust(
     `pycolmap.bundle_adjustment` does the same but logs to the terminal.
     """
     options.print_summary = False
-    if problem is None:
-        problem = pycolmap.BundleAdjustmentConfig()
-        for image_id in model.reg_image_ids():
-            problem.add_image(image_id)
-        problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    return pycolmap.create_default_bundle_adjuster(options, problem, model).solve()
+    return pycolmap.create_default_bundle_adjuster(options, problem or _whole(model), model).solve()
+
+
+def _whole(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    problem = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.reg_image_ids():
+        problem.add_image(image_id)
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return problem
 
 
 def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
@@ -179,13 +207,21 @@ def thinned(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return copy
 
 
-def adjusted_cost(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> float | None:
+def adjusted_cost(
+    model: pycolmap.Reconstruction,
+    options: pycolmap.BundleAdjustmentOptions,
+    *,
+    constant_cameras: Iterable[int] = (),
+) -> float | None:
     """Half the sum of the squared errors (px²) after adjusting a model in place, on one thread.
 
-    None if there is nothing to adjust.
+    None if there is nothing to adjust. The intrinsics of ``constant_cameras`` stay.
     """
     options.ceres.solver_options.num_threads = 1
-    summary = adjust(model, options)
+    problem = _whole(model)
+    for camera_id in constant_cameras:
+        problem.set_constant_cam_intrinsics(camera_id)
+    summary = adjust(model, options, problem)
     if not summary.is_solution_usable():
         return None
     # The type stubs know the base class of summaries only.

@@ -23,7 +23,13 @@ from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.errors import DatabaseError
-from corrsfm.reconstruction.calibration import has_possible_cameras, refine_intrinsics, restore_priors
+from corrsfm.reconstruction.calibration import (
+    DEFAULT_REFINEMENT,
+    Refinement,
+    has_possible_cameras,
+    refine_intrinsics,
+    restore_priors,
+)
 
 __all__ = [
     "Candidate",
@@ -93,7 +99,13 @@ class Candidate:
         return f"{self.mapper}-{self.cameras}-{self.seed}"
 
 
-def candidate_bank(*, seed: int, on_trial: StartingCameras | None, num_seeds: int = 3) -> list[Candidate]:
+def candidate_bank(
+    *,
+    seed: int,
+    on_trial: StartingCameras | None,
+    num_seeds: int = 3,
+    refinement: Refinement = DEFAULT_REFINEMENT,
+) -> list[Candidate]:
     """All candidates, in the order in which they are to be tried; the first model is not among them.
 
     Parameters
@@ -103,13 +115,18 @@ def candidate_bank(*, seed: int, on_trial: StartingCameras | None, num_seeds: in
     on_trial : StartingCameras or None
         Other cameras to try as well, see `find_cameras_on_trial`.
     num_seeds : int
-        How often each incremental kind is tried.
+        How often each kind is tried.
+    refinement : Refinement
+        Where intrinsics are not to change, candidates that differ by them alone are left out.
     """
     sources = [StartingCameras.AS_IS]
-    sources += [on_trial] if on_trial else []
-    sources += [StartingCameras.CALIBRATED]
     # By how near the best of its bank each kind came, on average; calibration is also slow.
     kinds = [MapperKind.GLOBAL, MapperKind.RELAXED, MapperKind.HELD, MapperKind.INCREMENTAL]
+    if refinement.intrinsics:
+        sources += [on_trial] if on_trial else []
+        sources += [StartingCameras.CALIBRATED]
+    else:
+        kinds.remove(MapperKind.HELD)
     bank = [
         Candidate(mapper=kind, cameras=source, seed=seed + turn)
         for turn in range(num_seeds)
@@ -125,7 +142,7 @@ def map_candidate(
     database: Path,
     workdir: Path,
     *,
-    refine_principal_point: bool = False,
+    refinement: Refinement = DEFAULT_REFINEMENT,
     num_threads: int = 1,
     max_runtime_seconds: int = 0,
 ) -> pycolmap.Reconstruction | None:
@@ -139,7 +156,7 @@ def map_candidate(
     workdir : Path
         Folder of this candidate alone. It keeps ``model/`` and ``candidate.json`` with the seconds it took;
         what an interrupted run left half finished is replaced.
-    refine_principal_point : bool
+    refinement : Refinement
     num_threads : int
         With 1 the model is a function of database and candidate; with more, only up to rounding.
     max_runtime_seconds : int
@@ -175,7 +192,7 @@ def map_candidate(
         pycolmap.set_random_seed(candidate.seed)
         prepared = _prepare_database(candidate, own, workdir)
         models = {} if prepared is None else _map(
-            candidate, prepared, scratch, refine_principal_point, num_threads, max_runtime_seconds
+            candidate, prepared, scratch, refinement, num_threads, max_runtime_seconds
         )  # fmt: skip
         possible = [one for one in models.values() if has_possible_cameras(one)]
         model = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
@@ -272,27 +289,27 @@ def _map(
     candidate: Candidate,
     database: Path,
     scratch: Path,
-    refine_principal_point: bool,
+    refinement: Refinement,
     num_threads: int,
     max_runtime_seconds: int,
 ) -> dict[int, pycolmap.Reconstruction]:
     # pycolmap insists on a folder of photos even if it reads none; colours come after the choice.
     if candidate.mapper is MapperKind.GLOBAL:
         return pycolmap.global_mapping(
-            database, scratch, scratch, _global_options(candidate.seed, refine_principal_point, num_threads)
+            database, scratch, scratch, _global_options(candidate.seed, refinement, num_threads)
         )
-    options = incremental_options(candidate, refine_principal_point, num_threads)
+    options = incremental_options(candidate, refinement, num_threads)
     if max_runtime_seconds:
         options.max_runtime_seconds = max_runtime_seconds
     models = pycolmap.incremental_mapping(database, scratch, scratch, options)
     if candidate.mapper is MapperKind.HELD:
         for model in models.values():
-            refine_intrinsics(model, refine_principal_point=refine_principal_point, num_threads=num_threads)
+            refine_intrinsics(model, refinement, num_threads=num_threads)
     return models
 
 
 def incremental_options(
-    candidate: Candidate, refine_principal_point: bool, num_threads: int
+    candidate: Candidate, refinement: Refinement, num_threads: int
 ) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's options for an incremental kind of candidate."""
     options = pycolmap.IncrementalPipelineOptions()
@@ -300,7 +317,8 @@ def incremental_options(
     options.min_num_matches = 1
     options.min_model_size = 3
     options.extract_colors = False
-    options.ba_refine_principal_point = refine_principal_point
+    options.ba_refine_focal_length = options.ba_refine_extra_params = refinement.intrinsics
+    options.ba_refine_principal_point = refinement.principal_point
     options.num_threads = options.mapper.num_threads = num_threads
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = candidate.seed
     if candidate.mapper is MapperKind.HELD:
@@ -312,9 +330,7 @@ def incremental_options(
     return options
 
 
-def _global_options(
-    seed: int, refine_principal_point: bool, num_threads: int
-) -> pycolmap.GlobalPipelineOptions:
+def _global_options(seed: int, refinement: Refinement, num_threads: int) -> pycolmap.GlobalPipelineOptions:
     options = pycolmap.GlobalPipelineOptions()
     options.min_num_matches = 1
     options.num_threads = options.mapper.num_threads = num_threads
@@ -322,5 +338,7 @@ def _global_options(
     options.mapper.rotation_averaging.random_seed = seed
     options.mapper.global_positioning.random_seed = seed
     options.mapper.retriangulation.random_seed = seed
-    options.mapper.bundle_adjustment.refine_principal_point = refine_principal_point
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_extra_params = refinement.intrinsics
+    adjustment.refine_principal_point = refinement.principal_point
     return options

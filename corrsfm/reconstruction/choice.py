@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TypeVar
 
 from corrsfm.reconstruction.agreement import agreement
@@ -120,13 +120,16 @@ class Choice:
         Best agreement of another candidate with the chosen one, among those that predict nearly as much:
         share of relative poses in [0, 1]. None if only the first model was looked at, 0 if the others
         predict less.
+    could_try_more : bool
+        Whether a larger `ChoicePolicy.max_models` would have brought another candidate.
     """
 
     chosen: Tried
     tried: tuple[Tried, ...]
     num_failed: int = 0
     reason: str
-    support: float | None = field(default=None)
+    support: float | None = None
+    could_try_more: bool = True
 
 
 def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
@@ -147,6 +150,7 @@ def choose_model(
     map_round: Callable[[Sequence[C]], Sequence[Tried | None]],
     count_predicted: Callable[[Views], int],
     policy: ChoicePolicy,
+    others: Sequence[Tried | None] = (),
     mend: Callable[[Tried], Tried | None] = lambda model: None,
 ) -> Choice:
     """Try candidates until the best model is confirmed or the budget is spent, and choose.
@@ -163,6 +167,8 @@ def choose_model(
     count_predicted : callable
         Number of predicted matches of a model.
     policy : ChoicePolicy
+    others : sequence of Tried or None
+        Candidates that have been mapped already.
     mend : callable, optional
         Registers the misplaced photos of a model again (`corrsfm.reconstruction.registration`); None if that
         gave nothing. Asked once about every model that is the best at the end of a round; what it returns is
@@ -191,14 +197,17 @@ def choose_model(
             if again is not None:
                 outcomes.append(counted(again))
 
-    outcomes: list[Tried | None] = [counted(first)]
+    outcomes: list[Tried | None] = [None if model is None else counted(model) for model in (first, *others)]
     mend_best(outcomes)
+    affordable = bank[: max(policy.max_models - len(outcomes), 0)]
     reason = "all candidates have been tried"
-    for candidates in _rounds(bank[: policy.max_models - 1], policy.round_size):
+    if could_try_more := len(affordable) < len(bank):
+        reason = "as many as allowed have been tried"
+    for candidates in _rounds(affordable, policy.round_size):
         outcomes += [None if model is None else counted(model) for model in map_round(candidates)]
         mend_best(outcomes)
         if why := _why_stop(outcomes, policy):
-            reason = why
+            reason, could_try_more = why, False
             break
     tried = [model for model in outcomes if model is not None]
     best = _best(tried)
@@ -208,6 +217,7 @@ def choose_model(
         num_failed=len(outcomes) - len(tried),
         reason=reason,
         support=_support(best, tried, policy.confirming_predicted),
+        could_try_more=could_try_more,
     )
 
 

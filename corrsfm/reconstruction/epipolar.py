@@ -97,6 +97,26 @@ class TwoViews:
         along0, along1 = ray0 @ translation, x1 @ translation
         return (ray01 * along1 - ray11 * along0 > 0) & (ray00 * along1 - ray01 * along0 > 0)
 
+    def far_distance_px(self, matches: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Distance of the keypoint in photo 1 to where a far point under the one in photo 0 would be.
+
+        No translation is needed for it, so it says more than an epipolar line where the camera only turned.
+
+        Parameters
+        ----------
+        matches : (K, 2) int
+            Keypoint indices.
+
+        Returns
+        -------
+        (K,) float64
+            Pixels of photo 1; NaN where the ray of photo 0 leads behind photo 1.
+        """
+        x0, x1 = self._homogeneous(matches)
+        ray0 = x0 @ self._cam1_from_cam0()[0].T
+        depth = np.where(ray0[:, 2] > 0, ray0[:, 2], np.nan)
+        return self.rays1.focal_px * np.linalg.norm(ray0[:, :2] / depth[:, None] - x1[:, :2], axis=1)
+
     def ray_angles_deg(self, matches: NDArray[np.integer]) -> NDArray[np.float64]:
         """Angle between the two rays of each match, in degrees; 0 where the camera only turned.
 

@@ -1,9 +1,10 @@
 """What a model explains: the share of the verified matches that agree with its poses.
 
 A match is explained if both photos are registered, it lies within 4 px of the epipolar geometry of the
-model's two poses, and in front of both photos. A pair is contradicted if both photos are registered and less
-than half of its matches are explained: one of the two photos is in the wrong place, or the verified geometry
-was wrong.
+model's two poses, and in front of both photos; where its two rays are parallel to within 4 px, noise
+decides the side, so those count in any case, as do photos of one standpoint that agree by rotation alone. A
+pair is contradicted if both photos are registered and less than half of its matches are explained: one of
+the two photos is in the wrong place, or the verified geometry was wrong.
 """
 
 from __future__ import annotations
@@ -219,4 +220,5 @@ def is_explained(
     -------
     (K,) bool
     """
-    return (two.sampson_distance_px(matches) < max_distance_px) & two.in_front(matches)
+    between = (two.sampson_distance_px(matches) < max_distance_px) & two.in_front(matches)
+    return between | (two.far_distance_px(matches) < max_distance_px)

@@ -14,7 +14,12 @@ import numpy as np
 import pycolmap
 
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
-from corrsfm.reconstruction.calibration import adjusted_cost, thinned
+from corrsfm.reconstruction.calibration import (
+    adjusted_cost,
+    focal_length_ratios,
+    has_prior_focal_lengths,
+    thinned,
+)
 from corrsfm.reconstruction.views import views_of
 
 __all__ = ["FocalSlack", "measure_focal_slack"]
@@ -42,42 +47,48 @@ class FocalSlack:
     pose_change_deg : float
         Median change of the relative poses by that, see
         `corrsfm.reconstruction.agreement.relative_pose_differences_deg`.
+    are_others_known : bool
+        Cameras of known focal length took other photos of the model, so an open one moves its photos only.
     """
 
     factor: float
     pose_change_deg: float
+    are_others_known: bool = False
 
     @property
     def is_large(self) -> bool:
         """Whether more than one focal length fits, and poses should not be relied on."""
-        return self.factor > _LARGEST_FACTOR or self.pose_change_deg > _LARGEST_POSE_CHANGE_DEG
+        is_open = self.factor > _LARGEST_FACTOR and not self.are_others_known
+        return is_open or self.pose_change_deg > _LARGEST_POSE_CHANGE_DEG
 
 
 def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
-    """Change the focal lengths of a model by 18 %, both ways, and see what it costs and what it moves.
+    """Change the open focal lengths of a model by 18 %, both ways; see what it costs and what it moves.
 
     Parameters
     ----------
     model : pycolmap.Reconstruction
-        Not changed.
+        Not changed. Cameras of known focal length stay as they are.
 
     Returns
     -------
     FocalSlack or None
-        The larger of both ways. None if the model has fewer than three photos or twenty points, or if nothing
-        could be adjusted.
+        The larger of both ways. None if no focal length is open, if the model has fewer than three photos
+        or twenty points, or if nothing could be adjusted.
     """
-    if model.num_reg_images() < 3 or model.num_points3D() < _MIN_NUM_POINTS:
+    if has_prior_focal_lengths(model) or model.num_reg_images() < 3 or model.num_points3D() < _MIN_NUM_POINTS:
         return None
     base = thinned(model)
     cost = _cost_of(base, refine_focal_length=True)
     if cost is None or cost <= 0:
         return None
-    views = views_of(base)
+    views, num_open = views_of(base), len(focal_length_ratios(base))
     found = []
     for factor in (_FACTOR, 1 / _FACTOR):
         other = pycolmap.Reconstruction(base)
         for camera in other.cameras.values():
+            if camera.has_prior_focal_length:
+                continue
             params = camera.params.copy()
             params[list(camera.focal_length_idxs())] *= factor
             camera.params = params
@@ -87,7 +98,13 @@ def measure_focal_slack(model: pycolmap.Reconstruction) -> FocalSlack | None:
         # Near the best focal length, costs rise with the square of the change and poses change in proportion.
         share = np.sqrt(_TOLERATED_RISE / max(other_cost / cost - 1, _SMALLEST_RISE))
         change_deg = float(np.median(relative_pose_differences_deg(views, views_of(other))))
-        found.append(FocalSlack(factor=float(_FACTOR**share), pose_change_deg=float(share * change_deg)))
+        found.append(
+            FocalSlack(
+                factor=float(_FACTOR**share),
+                pose_change_deg=float(share * change_deg),
+                are_others_known=num_open < base.num_reg_images(),
+            )
+        )
     return max(found, key=lambda slack: slack.pose_change_deg, default=None)
 
 
@@ -96,4 +113,5 @@ def _cost_of(model: pycolmap.Reconstruction, *, refine_focal_length: bool) -> fl
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal_length
     options.ceres.solver_options.max_num_iterations = _MAX_ITERATIONS
-    return adjusted_cost(model, options)
+    known = [camera.camera_id for camera in model.cameras.values() if camera.has_prior_focal_length]
+    return adjusted_cost(model, options, constant_cameras=known)

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from corrsfm.colmap.log import colmap_log
 from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.cache import load_cache
-from corrsfm.reconstruction.calibration import adjustment_options, has_possible_cameras, refine
+from corrsfm.reconstruction.calibration import (
+    DEFAULT_REFINEMENT,
+    Refinement,
+    adjustment_options,
+    has_possible_cameras,
+    refine,
+)
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.resection import Landmarks
 from corrsfm.reconstruction.same_points import candidates_of, observed, registered_images
@@ -86,8 +92,7 @@ def join_models(
     evidence: SceneEvidence,
     *,
     seed: int = 0,
-    refine_intrinsics: bool = True,
-    refine_principal_point: bool = False,
+    refinement: Refinement = DEFAULT_REFINEMENT,
     num_threads: int = 1,
 ) -> tuple[list[pycolmap.Reconstruction], list[Joining]]:
     """Join what can be joined of several models.
@@ -103,7 +108,7 @@ def join_models(
         That they were mapped from; not changed.
     evidence : SceneEvidence
     seed : int
-    refine_intrinsics, refine_principal_point : bool
+    refinement : Refinement
         What may change of the cameras when a joined model is adjusted.
     num_threads : int
 
@@ -120,9 +125,7 @@ def join_models(
     DatabaseError
         If the database cannot be read.
     """
-    options = adjustment_options(
-        intrinsics=refine_intrinsics, principal_point=refine_principal_point, num_threads=num_threads
-    )
+    options = adjustment_options(refinement, num_threads=num_threads)
     left = list(models)
     attempts: list[Joining] = []
     tried: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()

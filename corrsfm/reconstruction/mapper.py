@@ -20,7 +20,12 @@ from corrsfm.config import Mapper, ReconstructionConfig
 from corrsfm.disk import room_for
 from corrsfm.errors import DatabaseError, ReconstructionError
 from corrsfm.files import atomic_path
-from corrsfm.reconstruction.calibration import has_possible_cameras, is_plausible, refine_intrinsics
+from corrsfm.reconstruction.calibration import (
+    Refinement,
+    has_possible_cameras,
+    is_plausible,
+    refine_intrinsics,
+)
 from corrsfm.reconstruction.failure import read_pair_graph, why_no_model
 from corrsfm.types import ModelSummary
 
@@ -279,7 +284,7 @@ def _map_with_held_intrinsics(
     for model in mapped.values():
         refine_intrinsics(
             model,
-            refine_principal_point=options.ba_refine_principal_point,
+            Refinement(principal_point=options.ba_refine_principal_point),
             num_threads=max(options.num_threads, 0),
         )
     return mapped

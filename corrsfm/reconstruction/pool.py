@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 from corrsfm.files import read_json
 from corrsfm.machine import end_with_parent, hear_interruptions, unheard_by_children
+from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement
 from corrsfm.reconstruction.candidates import Candidate, map_candidate
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class CandidatePool:
         With verified two-view geometries; not changed.
     workdir : Path
         Every candidate gets a folder of its name here and is read from it if an earlier run finished it.
-    refine_principal_point : bool
+    refinement : Refinement
     num_processes : int
         1 maps in this process.
     max_runtime_seconds : int
@@ -48,14 +49,14 @@ class CandidatePool:
         database: Path,
         workdir: Path,
         *,
-        refine_principal_point: bool = False,
+        refinement: Refinement = DEFAULT_REFINEMENT,
         num_processes: int = 1,
         max_runtime_seconds: int = 0,
     ) -> None:
         self._database = database
         self._workdir = workdir
         self._options = {
-            "refine_principal_point": refine_principal_point,
+            "refinement": refinement,
             "max_runtime_seconds": max_runtime_seconds,
         }
         # A fork would copy pycolmap's threads in whatever state they are.

@@ -187,7 +187,8 @@ def sample_pairs(
 def predict_pair(neighbours: Neighbours, two: TwoViews) -> NDArray[np.int32]:
     """Predicted matches of a pair.
 
-    Of a keypoint's neighbours those count that lie on its epipolar line and in front of both photos. The
+    Of a keypoint's neighbours those count that lie on its epipolar line and in front of both photos, or so
+    far away that noise decides the side. The
     nearest is accepted if it is clearly nearer than the next that counts, or than the last neighbour where
     no other counts. Of several that accept the same keypoint of photo 1 the nearest stays.
 
@@ -208,7 +209,8 @@ def predict_pair(neighbours: Neighbours, two: TwoViews) -> NDArray[np.int32]:
     everything = np.column_stack([np.repeat(neighbours.keypoints, num), neighbours.indices.ravel()])
     near = np.flatnonzero(two.line_distance_px(everything) < MAX_LINE_DISTANCE_PX)
     counts = np.zeros(num0 * num, bool)
-    counts[near[two.in_front(everything[near])]] = True
+    on_line = everything[near]
+    counts[near] = two.in_front(on_line) | (two.far_distance_px(on_line) < MAX_LINE_DISTANCE_PX)
     counts = counts.reshape(num0, num)
     row = np.flatnonzero(counts.any(axis=1))
     first = counts[row].argmax(axis=1)

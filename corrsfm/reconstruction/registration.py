@@ -15,7 +15,7 @@ import pycolmap
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import copy_database, database_errors
-from corrsfm.reconstruction.calibration import restore_priors
+from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement, restore_priors
 from corrsfm.reconstruction.candidates import (
     Candidate,
     MapperKind,
@@ -35,7 +35,7 @@ def register_again(
     *,
     cameras: StartingCameras = StartingCameras.AS_IS,
     seed: int = 0,
-    refine_principal_point: bool = False,
+    refinement: Refinement = DEFAULT_REFINEMENT,
     num_threads: int = 1,
 ) -> pycolmap.Reconstruction | None:
     """Take photos out of a model, and go on mapping from there with lenient thresholds.
@@ -53,7 +53,7 @@ def register_again(
     cameras : StartingCameras
         What the model was mapped with in place of the cameras of the database.
     seed : int
-    refine_principal_point : bool
+    refinement : Refinement
     num_threads : int
         With 1 equal arguments give equal models.
 
@@ -88,7 +88,7 @@ def register_again(
         change_cameras(copy, cameras)
         database = copy
     candidate = Candidate(mapper=MapperKind.RELAXED, seed=seed)
-    options = incremental_options(candidate, refine_principal_point, num_threads)
+    options = incremental_options(candidate, refinement, num_threads)
     with colmap_log(), database_errors(database):
         pycolmap.set_random_seed(seed)
         models = pycolmap.incremental_mapping(database, workdir, found, options, input_path=given)

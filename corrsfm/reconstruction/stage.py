@@ -25,6 +25,7 @@ from corrsfm.graph import connected_components
 from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
 from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, policy_for, select_model
+from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mapper import reconstruct as map_database
@@ -213,7 +214,7 @@ class _Choice:
                 first_seconds=seconds,
                 seed=run.seed,
                 cameras_on_trial=self._cameras_on_trial(),
-                refine_principal_point=self._config.refine_principal_point,
+                refinement=Refinement.of(self._config),
                 num_processes=count_threads(run.threads),
                 unfold=self._config.unfold,
             )
@@ -248,8 +249,7 @@ class _Choice:
             self._workspace.database,
             self._evidence,
             seed=self._run.seed,
-            refine_intrinsics=self._config.refine_intrinsics,
-            refine_principal_point=self._config.refine_principal_point,
+            refinement=Refinement.of(self._config),
             num_threads=threads_for(len(self._names), count_threads(self._run.threads)),
         )
         for attempt in attempts:

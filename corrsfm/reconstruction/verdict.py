@@ -79,6 +79,8 @@ class Evidence:
     support : float or None
         How far the best other candidate agrees (`corrsfm.reconstruction.choice.Choice.support`); None if no
         other was mapped.
+    could_try_more : bool
+        Whether a larger ``--max-models-tried`` would bring other candidates.
     implausible_intrinsics : str
         What no camera can have, such as "focal lengths from 0.02 to 0.9 times the longest side"; empty if
         all are plausible.
@@ -99,6 +101,7 @@ class Evidence:
     num_photos: int
     explained: Explained
     support: float | None = None
+    could_try_more: bool = True
     implausible_intrinsics: str = ""
     has_prior_focal_lengths: bool = False
     focal_slack: FocalSlack | None = None
@@ -235,7 +238,7 @@ def _explained(evidence: Evidence) -> _Finding | None:
     return _Finding(
         Grade.DOUBTFUL if share >= _WRONG_EXPLAINED else Grade.WRONG,
         f"the model explains only {_percent(share)} of the matches of the pairs that agree with it",
-        "a larger --max-models-tried, or photos closer to each other",
+        _other_candidates(evidence),
     )
 
 
@@ -275,7 +278,7 @@ def _support(evidence: Evidence) -> _Finding | None:
         f"the best other candidate agrees about {_percent(evidence.support)} of the relative poses only"
         if evidence.support
         else "no other candidate comes near it",
-        "a larger --max-models-tried, or photos closer to each other",
+        _other_candidates(evidence),
     )
 
 
@@ -328,6 +331,11 @@ def _focal_slack(evidence: Evidence) -> _Finding | None:
         f"shorter fits nearly as well and moves the cameras by {slack.pose_change_deg:.1f}°",
         "--camera-params with a calibrated focal length, or photos at other distances and heights",
     )
+
+
+def _other_candidates(evidence: Evidence) -> str:
+    more = "a larger --max-models-tried" if evidence.could_try_more else "another --seed"
+    return f"{more}, or photos closer to each other"
 
 
 def _percent(share: float) -> str:

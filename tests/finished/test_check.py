@@ -150,16 +150,23 @@ def test_a_gap_without_matches_asks_for_photos(scene: FinishedScene, monkeypatch
     assert "corrsfm extract" in finding.next_step and "corrsfm reconstruct" in finding.next_step
 
 
-def test_a_wrong_model_comes_first_and_ends_with_a_code(scene: FinishedScene) -> None:
-    verdict = {
-        "grade": "wrong", "reasons": ["bent"], "next_steps": ["a larger --max-models-tried, or more photos"],
-    }  # fmt: skip
+@pytest.mark.parametrize(
+    ("advice", "flags"),
+    [
+        ("a larger --max-models-tried, or more photos", ["--max-models-tried", "48"]),
+        ("another --seed, or more photos", ["--seed", "1"]),
+    ],
+)
+def test_a_wrong_model_comes_first_and_ends_with_a_code(
+    scene: FinishedScene, advice: str, flags: list[str]
+) -> None:
+    verdict = {"grade": "wrong", "reasons": ["bent"], "next_steps": [advice]}
     evidence = scene.workspace / "evidence.json"
     evidence.write_text(json.dumps({"verdict": verdict}))
     Workspace(scene.workspace).finish("models", StageRecord(fingerprint="made up"))
     result = check_workspace(scene.workspace)
     assert result.findings[0].kind == "verdict" and not result.is_usable
-    assert shlex.split(result.findings[0].next_step)[-2:] == ["--max-models-tried", "48"]
+    assert shlex.split(result.findings[0].next_step)[-2:] == flags
     shown = CliRunner().invoke(main, ["check", str(scene.workspace)])
     assert shown.exit_code == 1 and "1. the model is wrong: bent" in shown.stdout
     values = json.loads(CliRunner().invoke(main, ["check", str(scene.workspace), "--json"]).stdout)

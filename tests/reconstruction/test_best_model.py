@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -13,6 +14,7 @@ from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.reconstruction import best_model
 from corrsfm.reconstruction.agreement import agreement
 from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
+from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.verdict import Grade
@@ -98,6 +100,41 @@ def test_a_candidate_stands_in_for_a_first_model_that_did_not_come(scene: Scene)
     selected = scene.select(None)
     assert selected is not None
     assert agreement(views_of(scene.truth), views_of(selected.model)).share == 1.0
+
+
+def test_all_that_the_round_of_a_stand_in_mapped_is_chosen_from(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounds = [[None, bent(scene.truth), scene.truth, None]]
+    monkeypatch.setattr(
+        best_model.CandidatePool, "map", lambda _, bank: rounds.pop() if rounds else [None] * len(bank)
+    )
+    monkeypatch.setattr(best_model.CandidatePool, "seconds", lambda *_: 0.1)
+    selected = scene.select(None, unfold=False)
+    assert selected is not None
+    assert selected.model is scene.truth
+
+
+def test_candidates_hold_intrinsics_as_the_first_model_did(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mappers = []
+    for name in ("incremental_mapping", "global_mapping"):
+        original = getattr(pycolmap, name)
+
+        def spy(*arguments: Any, original: Any = original, **options: Any) -> object:
+            mappers.append(arguments[3])
+            return original(*arguments, **options)
+
+        monkeypatch.setattr(pycolmap, name, spy)
+    scene.select(bent(scene.truth), refinement=Refinement(intrinsics=False, principal_point=True))
+    assert len(mappers) > 2
+    for options in mappers:
+        if isinstance(options, pycolmap.GlobalPipelineOptions):
+            adjustment = options.mapper.bundle_adjustment
+            assert not adjustment.refine_focal_length and adjustment.refine_principal_point
+        else:
+            assert not options.ba_refine_focal_length and options.ba_refine_principal_point
 
 
 def test_nothing_is_selected_where_nothing_can_be_mapped(scene: Scene) -> None:

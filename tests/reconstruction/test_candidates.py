@@ -9,6 +9,7 @@ import pytest
 from synthetic_database import synthesize
 
 from corrsfm.reconstruction.agreement import agreement
+from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.candidates import (
     Candidate,
     MapperKind,
@@ -43,6 +44,24 @@ def test_other_cameras_are_tried_only_where_they_are_on_trial() -> None:
     bank = candidate_bank(seed=0, on_trial=None)
     assert {candidate.cameras for candidate in bank} == {StartingCameras.AS_IS, StartingCameras.CALIBRATED}
     assert len(bank) == 3 * 2 * 4 - 1
+
+
+def test_held_intrinsics_leave_only_candidates_that_do_not_change_them() -> None:
+    bank = candidate_bank(seed=0, on_trial=StartingCameras.SEPARATE, refinement=Refinement(intrinsics=False))
+    assert {candidate.cameras for candidate in bank} == {StartingCameras.AS_IS}
+    assert {candidate.mapper for candidate in bank} == set(MapperKind) - {MapperKind.HELD}
+
+
+@pytest.mark.parametrize("mapper", sorted(set(MapperKind) - {MapperKind.HELD}))
+def test_a_candidate_keeps_intrinsics_that_are_not_to_be_refined(tmp_path: Path, mapper: MapperKind) -> None:
+    synthesize(tmp_path / "database.db")
+    true = spoil_focal_length(tmp_path / "database.db", 1.05)
+    model = map_candidate(
+        Candidate(mapper=mapper), tmp_path / "database.db", tmp_path / "candidate",
+        refinement=Refinement(intrinsics=False),
+    )  # fmt: skip
+    assert model is not None
+    assert model.cameras[1].mean_focal_length() == pytest.approx(1.05 * true)
 
 
 @pytest.mark.parametrize("mapper", list(MapperKind))

@@ -191,6 +191,15 @@ def test_the_budget_of_time_is_a_multiple_of_the_first_mapping() -> None:
     assert len(choice.tried) == 3
 
 
+def test_a_choice_knows_whether_more_could_have_been_tried() -> None:
+    bank = [tried("b", BENT_OTHERWISE)] * 4
+    for max_models, could in ((4, True), (5, False), (9, False)):
+        policy = dataclasses.replace(POLICY, max_models=max_models, min_models=99)
+        assert choose(tried("a", BENT), bank, policy).could_try_more is could
+    patient = dataclasses.replace(POLICY, max_models=4, patience=1)
+    assert not choose(tried("a", BENT), bank, patient).could_try_more
+
+
 @pytest.mark.parametrize("bank", [[], [tried("b", RIGHT)]])
 def test_without_a_budget_the_first_model_is_taken(bank: list[Tried]) -> None:
     choice = choose(tried("a", BENT), bank, dataclasses.replace(POLICY, max_models=1))

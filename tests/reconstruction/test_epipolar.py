@@ -28,6 +28,14 @@ def test_a_keypoint_off_its_line_is_as_far_as_it_was_moved() -> None:
     assert two.sampson_distance_px(SAME) == pytest.approx([5.0 / np.sqrt(2)])
 
 
+def test_far_points_need_no_translation() -> None:
+    two = two_views(np.eye(3), [0, 0, 0], [0.1, 0.2], [0.106, 0.208])
+    assert two.far_distance_px(SAME) == pytest.approx([5.0])
+    assert np.isnan(two.sampson_distance_px(SAME)).all()
+    behind = two_views(turn("y", 180.0), [0, 0, 0], [0.1, 0.2], [0.1, 0.2])
+    assert np.isnan(behind.far_distance_px(SAME)).all()
+
+
 def test_a_photo_of_long_focal_length_is_moved_by_more_pixels() -> None:
     two = two_views(np.eye(3), [-1, 0, 0], [0.1, 0.2], [-0.1, 0.21], focal0=300.0, focal1=400.0)
     assert two.line_distance_px(SAME) == pytest.approx([4.0])

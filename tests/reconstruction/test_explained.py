@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scene_of_points import bend, make_scene, turn
+from scene_of_points import CAMERA, bend, make_scene, turn
 
 from corrsfm.reconstruction.explained import explain
+from corrsfm.reconstruction.views import View
 
 
 def test_the_true_model_explains_everything() -> None:
@@ -119,3 +120,23 @@ def test_a_camera_that_only_turned_explains_nothing() -> None:
     explained = explain(still, scene.keypoints, {pair: scene.matches(pair)})
     assert (explained.num_explained, explained.widest_angle_deg) == (0, 0.0)
     assert len(explained.contradicted) == 1
+
+
+@pytest.mark.parametrize("jitter", [0.0, 1e-4, -1e-4])
+def test_photos_of_one_standpoint_agree_by_rotation_whatever_side_noise_says(jitter: float) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-3, -2, 8], [3, 2, 12], (200, 3))
+    views, keypoints = {}, {}
+    for number, angle in enumerate([-5.0, 5.0]):
+        rotation = turn("y", angle)
+        in_camera = points @ rotation.T
+        name = f"{number}.jpg"
+        translation = np.array([number * jitter, 0.0, 0.0])
+        views[name] = View(camera=CAMERA, rotation=rotation, translation=translation)
+        keypoints[name] = in_camera[:, :2] / in_camera[:, 2:] * 500.0 + [320.0, 240.0]
+        keypoints[name] += rng.normal(0, 0.5, (200, 2))
+    verified = {("0.jpg", "1.jpg"): np.column_stack([np.arange(200)] * 2)}
+    assert explain(views, keypoints, verified).share == 1.0
+    # Turned upwards by two degrees, 17 px, nothing agrees.
+    up = dataclasses.replace(views["1.jpg"], rotation=turn("x", 2.0) @ views["1.jpg"].rotation)
+    assert explain({**views, "1.jpg": up}, keypoints, verified).share < 0.1

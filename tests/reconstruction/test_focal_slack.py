@@ -58,6 +58,30 @@ def test_a_flat_wall_leaves_the_focal_length_open_and_a_deep_scene_does_not() ->
     assert wall.factor > 1.15 > 1.05 > deep.factor > 1
 
 
+def test_known_focal_lengths_are_not_open() -> None:
+    wall = past_a_wall()
+    given = wall.cameras[1]
+    given.has_prior_focal_length = True
+    assert measure_focal_slack(wall) is None
+    # One photo of unknown focal length among five of known: these hold it.
+    unknown = pycolmap.Camera(camera_id=2, model=given.model, width=given.width, height=given.height,
+                              params=given.params.copy())  # fmt: skip
+    mixed = pycolmap.Reconstruction()
+    for camera in (given, unknown):
+        mixed.add_camera_with_trivial_rig(camera)
+    for image in wall.images.values():
+        xy = np.array([point.xy for point in image.points2D])
+        copy = pycolmap.Image(
+            name=image.name, keypoints=xy, camera_id=2 if image.image_id == 3 else 1, image_id=image.image_id
+        )
+        mixed.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point in wall.points3D.values():
+        mixed.add_point3D(point.xyz, point.track)
+    slack = measure_focal_slack(mixed)
+    assert slack is not None and not slack.is_large
+    assert slack.pose_change_deg < 0.2
+
+
 def test_the_model_is_not_changed() -> None:
     model = around(3.0, 10.0)
     before = {image_id: image.cam_from_world().matrix() for image_id, image in model.images.items()}

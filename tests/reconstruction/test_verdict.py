@@ -108,6 +108,14 @@ def test_no_evidence_leaves_the_grade(change: dict) -> None:
     assert judge(dataclasses.replace(GOOD, **change)).grade is Grade.GOOD
 
 
+@pytest.mark.parametrize(
+    ("could", "step"), [(True, "a larger --max-models-tried"), (False, "another --seed")]
+)
+def test_more_models_are_advised_only_where_there_are_more(could: bool, step: str) -> None:
+    evidence = dataclasses.replace(evidence_of(SCENE.views), support=0.1, could_try_more=could)
+    assert judge(evidence).next_steps == (f"{step}, or photos closer to each other",)
+
+
 def test_the_gravest_reason_comes_first() -> None:
     verdict = judge(dataclasses.replace(GOOD, num_photos=6, thickness=0.0, is_folded=True))
     assert verdict.grade is Grade.WRONG
