@@ -51,6 +51,7 @@ __all__ = [
     "RATIO_STEPS",
     "CompactScene",
     "is_compact",
+    "lacks_shapes",
     "quantise_ratios",
     "read_labelled_pairs",
     "read_scenes",
@@ -58,9 +59,10 @@ __all__ = [
 ]
 
 NO_NEIGHBOUR = 65535
+"""Marks a keypoint without a match, so a photo has at most as many keypoints."""
 RATIO_STEPS = 255.0
-_LARGEST_SCENE_BYTES = 1 << 33
 """A stored ratio of 1."""
+_LARGEST_SCENE_BYTES = 1 << 33
 _FORMAT, _VERSION = "corrsfm-pairs", 1
 _NUM_PARAMS = 12
 
@@ -275,6 +277,22 @@ def is_compact(path: Path) -> bool:
     """Whether a file is a compact pair file, of any version, rather than of another HDF5 layout."""
     with open_pairs(path) as file:
         return bool(file.attrs.get("format") == _FORMAT)
+
+
+def lacks_shapes(path: Path) -> bool:
+    """Whether the keypoints of a compact file have neither scale nor orientation, so are not SIFT's.
+
+    False for other layouts, which do not tell.
+
+    Raises
+    ------
+    InputError
+        If the file is missing or its first scene damaged.
+    """
+    with open_pairs(path) as file:
+        if file.attrs.get("format") != _FORMAT:
+            return False
+        return any(np.isnan(_read_scene(path, name, file).log_scales).any() for name in sorted(file)[:1])
 
 
 def read_scenes(path: Path) -> list[CompactScene]:

@@ -64,9 +64,13 @@ class Batch:
     related: Tensor
 
     def distances(self) -> Tensor:
-        """Squared symmetric epipolar distances (B, N) to the truth; infinite where two places are shown."""
+        """Squared symmetric epipolar distances (B, N) to the truth.
+
+        Infinite where two places are shown, and where two photos of one place leave no epipolar geometry.
+        """
         distances = symmetric_epipolar_squared(self.true_correspondences, self.matrix)
-        return distances.masked_fill(~self.related[:, None], torch.inf)
+        has_geometry = self.related & (self.matrix != 0).any(-1).any(-1)
+        return distances.masked_fill(~has_geometry[:, None], torch.inf)
 
     def inliers(self) -> Tensor:
         """Matches (B, N) that agree with the truth; False for padding."""
@@ -209,10 +213,15 @@ class RealPairs:
         per_scene = torch.bincount(scene[negative], minlength=len(self.scene_names)).double()
         return torch.where(negative, per_scene[scene].clamp(min=1) ** (scene_power - 1), 0.0)
 
-    def _gather(self, pairs: Tensor, columns: Tensor) -> Batch:
-        """Matches ``columns`` (B, N) of ``pairs`` (B,); columns beyond a pair's matches are padding."""
+    def _gather(self, pairs: Tensor, columns: Tensor, lost: Tensor | None = None) -> Batch:
+        """Matches ``columns`` (B, N) of ``pairs`` (B,).
+
+        Columns beyond a pair's matches are padding, and so are those ``lost`` (B, N).
+        """
         a = self._arrays
         mask = columns < a["num_matches"][pairs][:, None]
+        if lost is not None:
+            mask &= ~lost
         rows = a["match_start"][pairs][:, None] + torch.where(mask, columns, 0)
         key0, key1 = a["key0"][rows].long(), a["key1"][rows].long()
         pinhole = torch.cat([a["points"][key0], a["points"][key1]], -1)
@@ -235,19 +244,22 @@ class RealPairs:
         pairs = torch.multinomial(self._weights, num_pairs, replacement=True, generator=generator)
         available = self._arrays["num_matches"][pairs]
         width = int(available.max())
-        # A random order of each pair's matches, padding last. Thinning moves some inliers to the end, which
-        # makes the pair as hard as a wider baseline would.
+        # A random order of each pair's matches, padding last. Thinning loses some inliers, which makes the
+        # pair as hard as a wider baseline would.
         order = torch.rand(num_pairs, width, device=self.device, generator=generator)
         columns = torch.arange(width, device=self.device)
+        lost = columns >= available[:, None]
         if config.thin_probability > 0:
             batch = self._gather(pairs, columns.expand(num_pairs, -1))
             inliers = batch.inliers()
             draw = torch.rand(num_pairs, 2, 1, device=self.device, generator=generator)
             keep = torch.where(draw[:, 0] < config.thin_probability, 0.15 + 0.85 * draw[:, 1], 1.0)
             thinned = inliers & (torch.rand(num_pairs, width, device=self.device, generator=generator) > keep)
-            order = order + thinned
-        order = order.masked_fill(columns >= available[:, None], torch.inf)
-        batch = self._gather(pairs, order.argsort(1)[:, :num_matches])
+            # A network cannot read a pair of none.
+            enough = available - thinned.sum(1) >= _MIN_INLIERS
+            lost = lost | (thinned & enough[:, None])
+        chosen = order.masked_fill(lost, torch.inf).argsort(1)[:, :num_matches]
+        batch = self._gather(pairs, chosen, lost.gather(1, chosen))
         guess = self._arrays["guess"][pairs]
         return augment(batch, guess, config, generator)
 

@@ -25,6 +25,7 @@ from corrsfm.config import FeaturesConfig
 from corrsfm.errors import ConfigError, ImageError, InputError, WorkspaceError, first_few
 from corrsfm.features import create_extractor, reads_colour
 from corrsfm.files import read_text
+from corrsfm.geometry import camera_centre
 from corrsfm.images.photos import read_colour, read_image
 from corrsfm.labelled.compact import NO_NEIGHBOUR, CompactScene, write_scenes
 from corrsfm.labelled.oanet import write_pairs
@@ -196,12 +197,22 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         extract(_check_size(images / name, read(images / name), camera), None)
         for name, camera in zip(model.names, model.cameras, strict=True)
     ]
+    if any(len(each) > NO_NEIGHBOUR for each in features):
+        raise InputError(
+            f"{folder}: a photo has more than {NO_NEIGHBOUR:,} features, too many for a file of pairs; "
+            f"try: --max-features {NO_NEIGHBOUR}"
+        )
     matchable = [index for index, each in enumerate(features) if len(each) >= _MIN_KEYPOINTS]
     counts = {pair: model.covisible.get(pair, 0) for pair in combinations(matchable, 2)}
-    usable = {pair: count for pair, count in counts.items() if count >= config.min_covisible}
+    usable = {
+        pair: count
+        for pair, count in counts.items()
+        if count >= config.min_covisible and _are_apart(model, *pair)
+    }
     if not usable:
         raise InputError(
-            f"{folder}: no pair of photos shares {config.min_covisible} points; give more photos"
+            f"{folder}: no two photos from different places share {config.min_covisible} points; "
+            "give more photos"
         )
     pairs = choose_pairs(usable, config.max_pairs_per_scene, config.seed)
     if config.negatives:
@@ -238,6 +249,14 @@ def prepare_scene(folder: Path, config: PrepareConfig) -> CompactScene:
         ratios=np.concatenate(ratios),
         mutual=np.concatenate(mutual),
     )
+
+
+def _are_apart(model: _SceneModel, index0: int, index1: int) -> bool:
+    """Whether two photos have an epipolar geometry: their centres are not one and the same."""
+    centre0, centre1 = (
+        camera_centre((model.rotations[index], model.translations[index])) for index in (index0, index1)
+    )
+    return not np.allclose(centre0, centre1, rtol=1e-9, atol=1e-9)
 
 
 def _or_nan(values: NDArray[np.float32] | None, num: int) -> NDArray[np.float32]:

@@ -1,5 +1,6 @@
 """The compact pair file: what goes in comes out within the quantisation, labels included."""
 
+import dataclasses
 import os
 from pathlib import Path
 
@@ -10,7 +11,13 @@ from labelled_scene import make_scene
 
 from corrsfm.errors import InputError
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq
-from corrsfm.labelled.compact import CompactScene, read_labelled_pairs, read_scenes, write_scenes
+from corrsfm.labelled.compact import (
+    CompactScene,
+    lacks_shapes,
+    read_labelled_pairs,
+    read_scenes,
+    write_scenes,
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +76,14 @@ def test_drawing_pairs_of_a_scene_does_not_depend_on_other_scenes(written, tmp_p
     assert len(alone) == 2
     for first, second in zip(both, alone, strict=True):
         np.testing.assert_array_equal(first.correspondences, second.correspondences)
+
+
+def test_a_file_tells_features_without_scale(written, tmp_path):
+    assert not lacks_shapes(written[0])
+    scene = written[1]
+    none = np.full(len(scene.log_scales), np.nan, np.float32)
+    write_scenes(tmp_path / "aliked.h5", [dataclasses.replace(scene, log_scales=none)])
+    assert lacks_shapes(tmp_path / "aliked.h5")
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path):

@@ -88,6 +88,27 @@ def test_thinning_lowers_the_share_of_right_matches(data):
     assert float(thinned) < 0.8 * float(plain)
 
 
+def test_thinning_loses_right_matches_of_pairs_that_are_drawn_whole(data):
+    config = dataclasses.replace(NO_AUGMENTATION, thin_probability=1.0)
+    whole, thinned = (data.sample(64, 100, c, generator_for(0, 0, 0, CPU)) for c in (NO_AUGMENTATION, config))
+    assert (whole.mask.sum(1) >= 59).all()
+    assert float(thinned.inliers().sum()) < 0.8 * float(whole.inliers().sum())
+    assert int((thinned.mask & ~thinned.inliers()).sum()) == int((whole.mask & ~whole.inliers()).sum())
+    assert (thinned.mask.sum(1) >= 20).all()
+
+
+def test_two_photos_from_one_place_are_not_trained_on():
+    scene = make_scene("a")
+    first, second = scene.pairs[0]
+    translations = scene.translations.copy()
+    rotation = scene.rotations[second] @ scene.rotations[first].T
+    translations[second] = rotation @ translations[first]
+    scene = dataclasses.replace(scene, translations=translations)
+    data = RealPairs([scene], CPU)
+    assert float(data.inlier_ratios[0]) == 0
+    assert float(data._weights[0]) == 0 and float(data._weights[1:].sum()) > 0
+
+
 def test_short_pairs_are_padded_and_masked(data):
     batch = data.sample(4, 100, NO_AUGMENTATION, generator_for(0, 0, 0, CPU))
     assert batch.mask.sum(1).tolist() == [59] * 4 or batch.correspondences.shape[1] == 60

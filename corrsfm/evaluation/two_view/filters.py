@@ -140,7 +140,9 @@ _SIDE = re.compile(r"(?:nn|mutual|ratio(?P<ratio>0?\.\d+|1(?:\.0)?)(?P<mutual>\+
 _PRUNER = re.compile(r"(?P<method>[a-z0-9]+)(?:@(?P<point>[a-z]+))?(?::(?P<model>.+))?")
 
 
-def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> PairFilter:
+def parse_filter(
+    text: str, *, device: str = "auto", seed: int = 0, threads: int = 0, is_sift: bool = True
+) -> PairFilter:
     """Build a filter from its name.
 
     Parameters
@@ -150,6 +152,8 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
         ``oracle`` (the inliers), or a method of `corrsfm prune` as ``METHOD[@sfm|@pose][:CHECKPOINT]``.
     device, seed, threads
         For methods of `corrsfm prune`.
+    is_sift : bool
+        Whether these methods apply SIFT's ratio test, as they do to matches of SIFT alone.
 
     Raises
     ------
@@ -174,7 +178,9 @@ def parse_filter(text: str, *, device: str = "auto", seed: int = 0, threads: int
             f"no filter '{text}'; expected nn, mutual, ratioT, ratioT+mutual with T such as 0.8, gms, "
             f"adalam, oracle, or METHOD[@POINT][:CHECKPOINT] with METHOD of {', '.join(methods)}"
         )
-    config = parse_prune_method(text, PruneConfig())
+    from corrsfm.prune import NO_MAX_RATIO
+
+    config = parse_prune_method(text, PruneConfig(max_ratio=None if is_sift else NO_MAX_RATIO))
     return PrunerFilter(text, config, device=device, seed=seed, threads=threads)
 
 

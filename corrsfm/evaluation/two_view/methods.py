@@ -119,7 +119,9 @@ class TwoViewMethod:
         return outputs
 
 
-def parse_method(text: str, *, device: str = "auto", seed: int = 0, threads: int = 0) -> TwoViewMethod:
+def parse_method(
+    text: str, *, device: str = "auto", seed: int = 0, threads: int = 0, is_sift: bool = True
+) -> TwoViewMethod:
     """Build a method from ``FILTER/ESTIMATOR``, such as ``ratio0.8+mutual/poselib``.
 
     See `parse_filter` and `parse_estimator`.
@@ -136,6 +138,6 @@ def parse_method(text: str, *, device: str = "auto", seed: int = 0, threads: int
     estimator = parse_estimator(estimator_text)
     return TwoViewMethod(
         name=text,
-        filter=parse_filter(filter_text, device=device, seed=seed, threads=threads),
+        filter=parse_filter(filter_text, device=device, seed=seed, threads=threads, is_sift=is_sift),
         estimator=estimator,
     )

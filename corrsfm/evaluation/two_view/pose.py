@@ -33,7 +33,7 @@ from corrsfm.evaluation.two_view.estimators import pose_errors_deg
 from corrsfm.evaluation.two_view.methods import MethodOutput, TwoViewMethod, parse_method
 from corrsfm.files import sha256_of
 from corrsfm.geometry import INLIER_THRESHOLD, essential_from_pose, symmetric_epipolar_distance_sq
-from corrsfm.labelled.compact import is_compact, read_labelled_pairs
+from corrsfm.labelled.compact import is_compact, lacks_shapes, read_labelled_pairs
 from corrsfm.labelled.oanet import OANetPair, read_pairs
 
 __all__ = [
@@ -309,7 +309,10 @@ def evaluate_pose(
     ------
     InputError, ConfigError
     """
-    built = [parse_method(name, device=device, seed=seed, threads=threads) for name in methods]
+    is_sift = not lacks_shapes(path)
+    built = [
+        parse_method(name, device=device, seed=seed, threads=threads, is_sift=is_sift) for name in methods
+    ]
     subject = _load_subject(path, max_per_scene, seed)
 
     def read(entry: dict[str, Any]) -> None:

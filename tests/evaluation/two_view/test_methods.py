@@ -85,6 +85,13 @@ def test_neighbourhood_filters_keep_what_moves_together(name: str, num: int):
     assert not result.inlier_mask[::100].any()
 
 
+def test_the_ratio_test_of_sift_is_not_applied_to_other_features():
+    pair = dataclasses.replace(make_pair(seed=0, num=100), ratios=np.full(100, 0.9, np.float32))
+    kept = [parse_filter("ratio", is_sift=is_sift)([pair])[0].inlier_mask for is_sift in (True, False)]
+    assert not kept[0].any()
+    np.testing.assert_array_equal(kept[1], pair.mutual)
+
+
 def test_gms_without_the_contributed_modules_says_what_to_install(monkeypatch):
     monkeypatch.delattr(cv2, "xfeatures2d", raising=False)
     with pytest.raises(DependencyError, match="pip install opencv-contrib-python-headless"):
