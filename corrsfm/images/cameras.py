@@ -142,7 +142,9 @@ def _tell_of_proposals(infos: Sequence[PhotoInfo], groups: Sequence[Sequence[int
                 info.width,
                 info.height,
             )
-        sizes[(info.width, info.height, info.camera_name, info.focal_px)] = len(group)
+        # COLMAP's names end in the size of the photo.
+        name = (info.camera_name or "").removesuffix(f"-{info.width}x{info.height}")
+        sizes[(info.width, info.height, name, info.focal_px)] = len(group)
     for (width, height, name, focal_px), num in sizes.items():
         num_turned = sizes.get((height, width, name, focal_px), 0)
         if width > height and num_turned:

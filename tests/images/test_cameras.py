@@ -60,6 +60,16 @@ def test_upright_and_turned_photos_are_named_as_one_camera(caplog: pytest.LogCap
     caplog.clear()
     ids_of([PLAIN, TALL], CameraMode.AUTO)
     assert not caplog.messages
+    # COLMAP puts the size into the name.
+    upright = dataclasses.replace(PHONE, width=PHONE.height, height=PHONE.width)
+    ids_of(
+        [
+            dataclasses.replace(info, camera_name=f"Acme-One-28.0-{info.width}x{info.height}")
+            for info in (PHONE, upright)
+        ],
+        CameraMode.AUTO,
+    )
+    assert len(caplog.messages) == 1
 
 
 def test_nothing_is_said_of_sharing_where_it_was_decided_or_cannot_be(
