@@ -441,6 +441,24 @@ def test_a_truncated_photo_is_left_out_on_request(
     }
 
 
+def test_options_that_name_files_hold_from_any_folder_and_files_may_move(
+    workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_photo(photos.parent / "masks" / "0.png.png", 0)
+    (photos.parent / "pairs.txt").write_text("0.png 1.png\n1.png 2.png\n")
+    monkeypatch.chdir(photos.parent)
+    listed = cfg.PairsConfig(pairing=(cfg.PairStrategy.FILE,), pairs_file=Path("pairs.txt"))
+    pipeline.index_photos(workspace, photos, cfg.ImagesConfig(mask_dir=Path("masks")), RUN)
+    pipeline.extract_features(workspace, SMALL, RUN)
+    pipeline.make_pairs(workspace, listed, RUN)
+    assert workspace.require("images").config["mask_dir"] == str(photos.parent / "masks")
+    assert workspace.require("pairs").config["pairs_file"] == str(photos.parent / "pairs.txt")
+    moved = dataclasses.replace(listed, pairs_file=Path("pairs.txt").rename("list.txt"))
+    assert pipeline.make_pairs(workspace, moved, RUN).skipped
+    Path("list.txt").write_text("0.png 1.png\n")
+    assert not pipeline.make_pairs(workspace, moved, RUN).skipped
+
+
 def test_a_left_out_photo_is_tried_again(
     workspace: Workspace, photos: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

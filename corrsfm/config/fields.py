@@ -225,12 +225,14 @@ def to_dict(config: Any, *, only_result: bool = False) -> dict[str, Any]:
 
 
 def absolute(config: T) -> T:
-    """A config whose files are named by absolute paths, for a process in another folder."""
+    """A config whose files and folders are named by absolute paths, for a process in another folder."""
     paths = {
         entry.name: value.absolute()
         for entry in dataclasses.fields(config)  # type: ignore[arg-type]
-        # What is no file may be the name of something that comes with the package.
-        if isinstance(value := getattr(config, entry.name), Path) and value.is_file()
+        # What is not there may be the name of something that comes with the package, as of a network, which
+        # is never a folder.
+        if isinstance(value := getattr(config, entry.name), Path)
+        and (value.is_file() or (value.is_dir() and entry.name != "model"))
     }
     return dataclasses.replace(config, **paths)  # type: ignore[type-var]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import time
@@ -97,7 +98,9 @@ def fingerprint_of(
     files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
     order = ["in the order of time"] if is_sequence else []
     photos = [[r.name, r.gps] for r in index.records]
-    return config_hash("pairs", config, seed, photos, features, *files, *order)
+    # What is in a file decides about equal pairs, not where it is.
+    options = dataclasses.replace(config, pairs_file=None, covisible_model=None)
+    return config_hash("pairs", options, seed, photos, features, *files, *order)
 
 
 def _without(names: set[str], pair_list: PairList) -> PairList:
@@ -117,5 +120,8 @@ def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
 
 def _content(path: Path) -> str:
     """Hash of what a file or all files of a folder hold; what reads them reports missing ones."""
-    files = sorted(path.iterdir()) if os.path.isdir(path) else [path] if os.path.exists(path) else []
-    return config_hash(*[[file.name, sha256_of(file)] for file in files if file.is_file()])
+    if os.path.isdir(path):
+        return config_hash(
+            *[[file.name, sha256_of(file)] for file in sorted(path.iterdir()) if file.is_file()]
+        )
+    return config_hash(sha256_of(path) if os.path.isfile(path) else "")

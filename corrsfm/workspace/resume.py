@@ -231,7 +231,8 @@ def finish(
         outcome.stage,
         StageRecord(
             fingerprint=fingerprint,
-            config=cfg.to_dict(config),
+            # A later command, from another folder, reads them from here.
+            config=cfg.to_dict(cfg.absolute(config)),
             inputs=inputs or {},
             seconds=round(outcome.seconds if cost is None else cost, 3),
             num_items=outcome.num_items,
@@ -245,7 +246,7 @@ def explain(workspace: Workspace, stage: str, config: Any) -> None:
     record = workspace.record_of(stage)
     if record is None:
         return
-    new = cfg.to_dict(config)
+    new = cfg.to_dict(cfg.absolute(config))
     changes = [
         f"{key} {_shown(record.config.get(key))} → {_shown(new[key])}"
         for key in new
