@@ -7,14 +7,12 @@ matches.db and those of pruned, which take in one item after the other (`corrsfm
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import itertools
 import logging
 import os
 import shlex
 import shutil
 from collections.abc import Iterator
-from io import FileIO
 from pathlib import Path
 
 from corrsfm import config as cfg
@@ -22,7 +20,7 @@ from corrsfm.disk import why_not
 from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
 from corrsfm.files import OWN_RECORD, replaced_name
 from corrsfm.workspace.entries import check_entries
-from corrsfm.workspace.lease import hold, holder_of
+from corrsfm.workspace.lease import hold, hold_for_reading
 from corrsfm.workspace.ledger import Ledger
 from corrsfm.workspace.manifest import FORMAT_VERSION, has_lost_manifest, read_manifest
 
@@ -68,6 +66,7 @@ class Workspace(Ledger):
         # begun earlier.
         self._begun: tuple[set[str], list[Path]] | None = None
         self.is_only_read = False
+        self._may_begin = create
         if not self.manifest.exists():
             self._start(create)
         self._values = read_manifest(self.manifest)
@@ -124,7 +123,10 @@ class Workspace(Ledger):
         WorkspaceError
             If another process holds it, or nothing can be written there.
         """
-        with hold(self.root / ".lock", wait=wait):
+        with hold(self.root / ".lock", wait=wait, make=self._may_begin):
+            # The one that was waited for had begun it, with input that cannot be used, and took it away.
+            if self._may_begin and not self.manifest.exists():
+                self._start(create=True)
             check_entries(self.root, self._own_names, may_link=False)
             self._values = read_manifest(self.manifest)
             if self._values["format_version"] < FORMAT_VERSION:
@@ -194,18 +196,7 @@ class Workspace(Ledger):
             If another process works there.
         """
         self.modernise()
-        with contextlib.ExitStack() as stack:
-            with contextlib.suppress(OSError):
-                # A pipe in its place would hold the opening up.
-                flags = os.O_RDONLY | os.O_NONBLOCK
-                handle = stack.enter_context(FileIO(os.open(self.root / ".lock", flags), "r"))
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                except BlockingIOError as error:
-                    who = holder_of(handle)
-                    raise WorkspaceError(
-                        f"{self.root}: another corrsfm works in this folder{who}; wait for it"
-                    ) from error
+        with hold_for_reading(self.root / ".lock"), contextlib.ExitStack() as stack:
             check_entries(self.root, self._own_names, may_link=True)
             self._values = read_manifest(self.manifest)
             self.is_only_read = True

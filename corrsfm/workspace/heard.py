@@ -8,9 +8,12 @@ import threading
 from collections.abc import Iterator
 from typing import TypeVar
 
-__all__ = ["ThreadWarnings", "listening"]
+__all__ = ["PASSING", "ThreadWarnings", "listening"]
 
 logger = logging.getLogger("corrsfm")
+
+PASSING = {"is_passing": True}
+"""The ``extra`` of a warning that says nothing about what comes out, such as of a wait."""
 
 
 class ThreadWarnings(logging.Handler):
@@ -21,7 +24,7 @@ class ThreadWarnings(logging.Handler):
         self._thread = threading.get_ident()
 
     def emit(self, record: logging.LogRecord) -> None:
-        if record.thread == self._thread:
+        if record.thread == self._thread and not getattr(record, "is_passing", False):
             self.hear(record)
 
     def hear(self, record: logging.LogRecord) -> None:

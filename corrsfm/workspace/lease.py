@@ -30,8 +30,9 @@ from pathlib import Path
 
 from corrsfm.disk import explain, is_of_the_disk
 from corrsfm.errors import WorkspaceError
+from corrsfm.workspace.heard import PASSING
 
-__all__ = ["BEAT_SECONDS", "LEASE_SECONDS", "hold", "holder_of"]
+__all__ = ["BEAT_SECONDS", "LEASE_SECONDS", "hold", "hold_for_reading"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -73,7 +74,7 @@ class _State(enum.Enum):
 
 
 @contextlib.contextmanager
-def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
+def hold(path: Path, *, wait: bool = False, make: bool = False) -> Iterator[None]:
     """Hold the folder of a lock file for this process.
 
     Parameters
@@ -82,6 +83,8 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
         The lock file.
     wait : bool
         Wait for another holder instead of failing.
+    make : bool
+        Make the folder again if another holder removed it.
 
     Raises
     ------
@@ -89,7 +92,7 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
         If another process holds it, or nothing can be written there.
     """
     me = _Holder(HOST, os.getpid(), uuid.uuid4().hex)
-    with _take(path, me, wait) as file:
+    with _take(path, me, wait=wait, make=make) as file:
         stopped = threading.Event()
         heart = threading.Thread(target=_beat, args=(path, file, me, stopped), daemon=True)
         heart.start()
@@ -102,12 +105,12 @@ def hold(path: Path, *, wait: bool = False) -> Iterator[None]:
                 file.truncate(0)
 
 
-def _take(path: Path, me: _Holder, wait: bool) -> FileIO:
+def _take(path: Path, me: _Holder, *, wait: bool, make: bool) -> FileIO:
     """The open lock file, once this process holds it."""
     seen: float | None = None
     while True:
         with contextlib.ExitStack() as stack:
-            file = stack.enter_context(_open(path))
+            file = stack.enter_context(_open(path, make=make))
             is_locked = _lock(file, path)
             state, holder = _judge(file, path, me, is_locked)
             if state is _State.FREE:
@@ -132,14 +135,50 @@ def _take(path: Path, me: _Holder, wait: bool) -> FileIO:
                 f"{path.parent}: another corrsfm works in this folder{who}; wait for it or choose another one"
             )
         if seen is None:
-            logger.warning("%s: waiting for another corrsfm%s to end", path.parent, who)
+            logger.warning("%s: waiting for another corrsfm%s to end", path.parent, who, extra=PASSING)
         seen = renewed
         time.sleep(POLL_SECONDS)
 
 
-def holder_of(file: FileIO) -> str:
-    """The holder that an open lock file names, in brackets and with a space before; empty if none."""
-    return _named(_read(file))
+@contextlib.contextmanager
+def hold_for_reading(path: Path) -> Iterator[None]:
+    """Keep writers out of the folder of a lock file, as far as the file system tells them; changes nothing.
+
+    Raises
+    ------
+    WorkspaceError
+        If another process holds it.
+    """
+    with contextlib.ExitStack() as stack:
+        # Without a lock file, or the right to read it, there is nobody to tell of.
+        with contextlib.suppress(OSError):
+            # A pipe in its place would hold the opening up.
+            file = stack.enter_context(FileIO(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "r"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                is_held = _is_renewed_elsewhere(file, path)
+            except BlockingIOError:
+                is_held = True
+            if is_held:
+                who = _named(_read(file))
+                raise WorkspaceError(f"{path.parent}: another corrsfm works in this folder{who}; wait for it")
+        yield
+
+
+def _is_renewed_elsewhere(file: FileIO, path: Path) -> bool:
+    """Whether another machine, whose lock the kernel here does not see, renews its hold."""
+    holder, seen = _read(file), os.fstat(file.fileno()).st_mtime
+    if holder is None or holder.is_here or abs(_now(path.parent) - seen) > LEASE_SECONDS:
+        return False
+    who = _named(holder)
+    logger.warning(
+        "%s: another corrsfm%s was here; looking whether it still is", path.parent, who, extra=PASSING
+    )
+    while abs(_now(path.parent) - seen) <= LEASE_SECONDS:
+        time.sleep(POLL_SECONDS)
+        if os.fstat(file.fileno()).st_mtime != seen:
+            return _read(file) is not None
+    return False
 
 
 def _named(holder: _Holder | None) -> str:
@@ -175,8 +214,10 @@ def _judge(file: FileIO, path: Path, me: _Holder, is_locked: bool | None) -> tup
     return (_State.UNSURE if is_locked else _State.HELD), holder
 
 
-def _open(path: Path) -> FileIO:
+def _open(path: Path, *, make: bool) -> FileIO:
     try:
+        if make:
+            path.parent.mkdir(parents=True, exist_ok=True)
         # A link in its place could lead to any file, and a pipe hold up whoever reads it.
         file = FileIO(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666), "r+")
         if stat.S_ISREG(os.fstat(file.fileno()).st_mode):

@@ -8,6 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -241,6 +242,24 @@ def test_a_second_process_cannot_lock_a_workspace(workspace: Workspace) -> None:
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         assert "another corrsfm works in this folder" in output
     assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "locked\n"
+
+
+def test_one_that_waits_begins_a_workspace_anew_that_the_first_gave_up(tmp_path: Path) -> None:
+    code = (
+        "import sys; from pathlib import Path; from corrsfm.workspace import Workspace\n"
+        "workspace = Workspace(Path(sys.argv[1]), create=True); print('begun', flush=True)\n"
+        "with workspace.lock(wait=True): print(workspace.manifest.exists())\n"
+    )
+    first = Workspace(tmp_path / "scene", create=True)
+    with pytest.raises(InputError), first.lock():
+        second = subprocess.Popen(
+            [sys.executable, "-c", code, str(first.root)], stdout=subprocess.PIPE, text=True
+        )
+        assert second.stdout is not None and second.stdout.readline() == "begun\n"
+        time.sleep(1.0)
+        raise InputError("no photos")
+    assert second.communicate()[0] == "True\n"
+    assert second.returncode == 0
 
 
 def test_a_failing_lock_is_not_taken_for_another_process(

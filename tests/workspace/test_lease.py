@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 
 from corrsfm.errors import WorkspaceError
 from corrsfm.workspace import lease
-from corrsfm.workspace.lease import hold
+from corrsfm.workspace.lease import hold, hold_for_reading
 
 HOLDER = """
 import sys, time
@@ -96,6 +97,47 @@ def test_a_second_one_may_wait_for_the_first(path: Path, caplog: pytest.LogCaptu
     with hold(path, wait=True):
         assert f"waiting for another corrsfm (process {other.pid} on " in caplog.text
     end(other)
+
+
+def test_one_that_waits_makes_a_folder_again_that_the_first_took_away(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "scene" / ".lock"
+    path.parent.mkdir(parents=True)
+    other = holder(path)
+
+    def take_away() -> None:
+        shutil.rmtree(tmp_path / "new")
+        other.kill()
+
+    threading.Timer(0.5, take_away).start()
+    with hold(path, wait=True, make=True):
+        assert path.exists()
+    end(other)
+
+
+def test_who_reads_is_kept_out_by_a_holder_here_and_elsewhere(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with hold_for_reading(path):
+        pass
+    assert not path.exists()
+    other = holder(path)
+    with pytest.raises(WorkspaceError, match=rf"\(process {other.pid} on "), hold_for_reading(path):
+        pass
+    end(other)
+    other = holder(path, "elsewhere")
+    # A lock that is known within each machine only.
+    monkeypatch.setattr(fcntl, "flock", lambda *_: None)
+    with pytest.raises(WorkspaceError, match=rf"process {other.pid} on elsewhere"), hold_for_reading(path):
+        pass
+    end(other)
+
+
+@pytest.mark.usefixtures("short")
+def test_who_reads_waits_for_a_machine_that_vanished_and_no_longer(path: Path) -> None:
+    end(holder(path, "elsewhere"))
+    started = time.monotonic()
+    with hold_for_reading(path):
+        assert 0.3 < time.monotonic() - started < 20
 
 
 def test_a_file_of_an_older_corrsfm_or_of_rubbish_is_free(path: Path) -> None:

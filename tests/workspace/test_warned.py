@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from corrsfm.workspace import Workspace
+from corrsfm.workspace.heard import PASSING
 from corrsfm.workspace.resume import StageOutcome
 from corrsfm.workspace.warned import (
     MAX_CHARACTERS,
@@ -90,6 +91,12 @@ def test_number_and_length_are_bounded() -> None:
     assert len(messages[0]) == MAX_CHARACTERS + 2
     assert len(messages) == MAX_WARNINGS + 1
     assert messages[-1] == "5 more, in the terminal only"
+
+
+def test_what_says_nothing_about_the_result_is_not_collected() -> None:
+    with collect_warnings() as messages:
+        logger.warning("waiting", extra=PASSING)
+    assert messages == []
 
 
 def test_only_warnings_of_this_thread_are_collected() -> None:
