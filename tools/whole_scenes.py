@@ -161,8 +161,15 @@ def run_corrsfm(setting: Corrsfm, scene: Path, seed: int, work: Path) -> Path:
     extracted = work / "-".join(["extracted", *setting.extract])
     call(*corrsfm, "extract", scene / "images", extracted, *setting.extract, "--threads", 1)
     workspace = work / re.sub(r"\W+", "_", setting.name)
+    pruned = workspace.with_name(f"{workspace.name}_pruned")
+    # What a network keeps does not hang on the seed; `prune` makes the rest again.
+    if not pruned.exists():
+        shutil.rmtree(workspace, ignore_errors=True)
+        shutil.copytree(extracted, workspace)
+        call(*corrsfm, "prune", workspace, *setting.prune, "--threads", 1)
+        workspace.rename(pruned)
     shutil.rmtree(workspace, ignore_errors=True)
-    shutil.copytree(extracted, workspace)
+    shutil.copytree(pruned, workspace)
     call(*corrsfm, "prune", workspace, *setting.prune, "--seed", seed, "--threads", 1)
     call(*corrsfm, "reconstruct", workspace, *setting.reconstruct, "--seed", seed, "--threads", 1)
     return workspace
