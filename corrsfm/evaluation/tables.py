@@ -244,7 +244,10 @@ def _pycolmap_table(values: dict[str, Any]) -> Table:
 
 
 def _whole_scenes_table(values: dict[str, Any]) -> Table:
-    """Scenes by columns; of a column's settings the one with the best median, and which that is."""
+    """Scenes by columns; of a column's settings the one with the best median, and which that is.
+
+    More columns than scenes, each of one setting, go down the page instead.
+    """
     found: dict[str, dict[str, list[dict[str, Any]]]] = {}
     for row in values["rows"]:
         found.setdefault(row["scene"], {}).setdefault(row["column"], []).append(row)
@@ -252,6 +255,17 @@ def _whole_scenes_table(values: dict[str, Any]) -> Table:
     settings = {(row["column"], row["setting"]) for row in values["rows"]}
     is_choice = {column: sum(one == column for one, _ in settings) > 1 for column in columns}
     num_seeds = max(len(row["runs"]) for row in values["rows"])
+    caption = f"AUC@5 of {num_seeds} seeds: median (worst). {_origin(values)}"
+    if len(columns) > len(found) and not any(is_choice.values()):
+        cells_of = {
+            scene: {column: _runs_cell(rows[0]["runs"], num_seeds) for column, rows in by_column.items()}
+            for scene, by_column in found.items()
+        }
+        return Table(
+            header=["matches kept by", *found],
+            rows=[[name, *(cells_of[scene].get(name, "–") for scene in found)] for name in columns],
+            caption=caption,
+        )
     header = ["scene", "photos"]
     for column in columns:
         header += [column, "which"] if is_choice[column] else [column]
@@ -265,7 +279,6 @@ def _whole_scenes_table(values: dict[str, Any]) -> Table:
             if is_choice[column]:
                 cells.append(f"{best['setting']} (of {len(choice)})" if best else "–")
         rows.append(cells)
-    caption = f"AUC@5 of {num_seeds} seeds: median (worst). {_origin(values)}"
     return Table(header=header, rows=rows, caption=caption)
 
 

@@ -53,23 +53,26 @@ def test_other_results_of_the_project_have_a_table(repository: Path, name: str):
     assert table.count("\n| ") >= len(values["rows"])
 
 
-def test_whole_scenes_show_median_and_worst_of_the_best_setting() -> None:
-    def row(scene: str, column: str, setting: str, scores: list[float], least: int = 10) -> dict[str, object]:
-        runs = [
-            {"seed": seed, "auc5": score, "num_registered": 10 if score else least, "num_photos": 10}
-            for seed, score in enumerate(scores)
-        ]
-        return {"scene": scene, "column": column, "setting": setting, "runs": runs}
+def scene_row(
+    scene: str, column: str, setting: str, scores: list[float], least: int = 10
+) -> dict[str, object]:
+    runs = [
+        {"seed": seed, "auc5": score, "num_registered": 10 if score else least, "num_photos": 10}
+        for seed, score in enumerate(scores)
+    ]
+    return {"scene": scene, "column": column, "setting": setting, "runs": runs}
 
+
+def test_whole_scenes_show_median_and_worst_of_the_best_setting() -> None:
     values = {
         "kind": "whole_scenes",
         "provenance": {"versions": {"corrsfm": "0.1.0"}, "seed": 0},
         "rows": [
-            row("desk", "plain", "global", [80.0, 60.0, 90.0]),
+            scene_row("desk", "plain", "global", [80.0, 60.0, 90.0]),
             # A run without a model counts as 0, in the median too.
-            row("desk", "plain", "incremental", [95.0, 0.0, 0.0], least=0),
-            row("desk", "ours", "ours", [90.0, 0.0, 91.0], least=0),
-            row("door", "plain", "incremental", [70.0]),
+            scene_row("desk", "plain", "incremental", [95.0, 0.0, 0.0], least=0),
+            scene_row("desk", "ours", "ours", [90.0, 0.0, 91.0], least=0),
+            scene_row("door", "plain", "incremental", [70.0]),
         ],
     }
     text = render_table(values)
@@ -77,3 +80,17 @@ def test_whole_scenes_show_median_and_worst_of_the_best_setting() -> None:
     assert "| desk | 10 | 80.0 (60.0) | global (of 2) | 90.0 (0.0), 0/10 |" in text
     assert "| door | 10 | 70.0 (70.0), 1 of 3 seeds | incremental (of 1) | – |" in text
     assert "AUC@5 of 3 seeds: median (worst). corrsfm 0.1.0" in text
+
+
+def test_many_ways_over_few_scenes_go_down_the_page() -> None:
+    values = {
+        "kind": "whole_scenes",
+        "provenance": {"versions": {"corrsfm": "0.1.0"}, "seed": 0},
+        "rows": [
+            scene_row("desk", "clnet", "rival clnet", [80.0, 60.0, 90.0]),
+            scene_row("desk", "oanet", "rival oanet", [95.0, 0.0, 0.0], least=0),
+        ],
+    }
+    text = render_table(values)
+    assert "| matches kept by | desk |" in text
+    assert "| clnet | 80.0 (60.0) |" in text and "| oanet | 0.0 (0.0), 0/10 |" in text
