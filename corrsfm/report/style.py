@@ -20,7 +20,7 @@ _STYLE = """
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--paper); color: var(--ink); font: 16px/1.5 system-ui, -apple-system,
   "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-header, main { max-width: 1080px; margin: 0 auto; padding: 0 20px; }
+header, main { max-width: 1240px; margin: 0 auto; padding: 0 20px; }
 header { padding-top: 28px; }
 h1 { font-size: 1.9rem; line-height: 1.2; margin: 0; overflow-wrap: anywhere; }
 header p, .note, figcaption { color: var(--quiet); font-size: .9rem; margin: 4px 0 0; }
@@ -39,8 +39,8 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { text-align: left; vertical-align: top; padding: 5px 18px 5px 0; border-bottom: 1px solid #eceae4; }
 tr:last-child > * { border-bottom: 0; }
 th { font-weight: 500; color: var(--quiet); white-space: nowrap; }
-.numbers { margin-top: 14px; }
-.numbers th, .numbers td { text-align: right; padding-right: 12px; }
+.numbers { margin-top: 14px; font-size: .93em; }
+.numbers th, .numbers td { text-align: right; padding-right: 11px; }
 .numbers td { white-space: nowrap; }
 .numbers th { white-space: normal; vertical-align: bottom; }
 .numbers.names td { white-space: normal; }
