@@ -133,7 +133,8 @@ def _remark(names: Sequence[str], camera: Camera, outcome: FocalVotes) -> str:
         case VoteDecision.SCATTERED:
             return (
                 f"{photos} seem to be of many cameras: the matches of {pairs} agree on no focal length; each "
-                "photo gets a camera; if one camera took them, use --camera-mode single"
+                "photo gets a camera, unless a model with one for all predicts as many matches; if one "
+                "camera took them, use --camera-mode single"
             )
     return (
         f"{photos} share a camera of a guessed focal length: the matches of {pairs} do not determine it; "

@@ -133,6 +133,8 @@ class Selection:
         Of the selected model, counted on all verified matches.
     left_out : tuple of Pair
         Verified pairs that were left out to unfold the model, sorted; mostly none.
+    cameras : StartingCameras
+        What it was mapped with.
     """
 
     model: pycolmap.Reconstruction
@@ -140,6 +142,7 @@ class Selection:
     verdict: Verdict
     folds: FoldEvidence
     left_out: tuple[Pair, ...] = ()
+    cameras: StartingCameras = StartingCameras.AS_IS
 
 
 def policy_for(max_models: int, first_seconds: float) -> ChoicePolicy:
@@ -216,6 +219,10 @@ def select_model(
             has_more_cameras=has_more_cameras,
         )
 
+    def has_more_cameras(cameras: StartingCameras) -> bool:
+        others_share = cameras_on_trial is StartingCameras.SHARED
+        return cameras is StartingCameras.SEPARATE or (others_share and cameras is not cameras_on_trial)
+
     bank = candidate_bank(seed=seed, on_trial=cameras_on_trial, refinement=refinement)
     cameras_of = {candidate.name: candidate.cameras for candidate in bank}
     with CandidatePool(
@@ -235,7 +242,7 @@ def select_model(
                     one.name,
                     model,
                     pool.seconds(one),
-                    has_more_cameras=one.cameras is StartingCameras.SEPARATE,
+                    has_more_cameras=has_more_cameras(one.cameras),
                 )
                 for one, model in outcomes
             ]
@@ -260,10 +267,9 @@ def select_model(
         start, others = None, []
         if first is not None:
             start = tried(FIRST, first, first_seconds)
-            # Fewer focal lengths may be found where many are open; the other candidates leave them as open.
+            # With a camera for each photo a wrong model explains nearly everything, too.
             if cameras_on_trial is StartingCameras.SHARED:
-                slack = measure_focal_slack(first)
-                start = dataclasses.replace(start, is_open=slack is not None and slack.is_large)
+                start = dataclasses.replace(start, is_open=True, has_more_cameras=True)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
             others = map_round(candidates)
@@ -294,6 +300,7 @@ def select_model(
         choice=choice,
         verdict=_verdict(model, choice, len(evidence.names), attempt.evidence),
         folds=attempt.evidence,
+        cameras=cameras_of.get(choice.chosen.name, StartingCameras.AS_IS),
     )
 
 

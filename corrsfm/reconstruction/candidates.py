@@ -123,7 +123,9 @@ def candidate_bank(
     # By how near the best of its bank each kind came, on average; calibration is also slow.
     kinds = [MapperKind.GLOBAL, MapperKind.RELAXED, MapperKind.HELD, MapperKind.INCREMENTAL]
     if refinement.intrinsics:
-        sources += [on_trial] if on_trial else []
+        # Before the others confirm a model that only ever had a camera for each photo.
+        if on_trial:
+            sources.insert(0 if on_trial is StartingCameras.SHARED else 1, on_trial)
         sources += [StartingCameras.CALIBRATED]
     else:
         kinds.remove(MapperKind.HELD)

@@ -77,9 +77,9 @@ class Tried:
     seconds : float
         Of the mapping.
     is_open : bool
-        The photos leave its focal lengths open, and other candidates may fix them.
+        It has a camera for each photo, and other candidates share one.
     has_more_cameras : bool
-        It has more cameras than the first model.
+        It has more cameras than other candidates.
     num_predicted : int or None
         None until a choice has to be made.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from corrsfm.reconstruction.best_model import SceneEvidence, Selection
+from corrsfm.reconstruction.candidates import StartingCameras
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.explained import ExplainedPair
 
@@ -14,6 +15,13 @@ FORMAT_VERSION = 1
 _NUM_WORST = 5
 # Pairs of which every match is recorded, for pictures; all of them would make the record long.
 _NUM_IN_FULL = 12
+
+_CAMERA_REMARKS = {
+    StartingCameras.SHARED: "the model that was chosen has one camera for all photos of a size: it predicts "
+    "as many matches",
+    StartingCameras.SEPARATE: "the model that was chosen has a camera for each photo: it predicts clearly "
+    "more matches",
+}
 
 
 def record_of(selection: Selection, evidence: SceneEvidence) -> dict[str, Any]:
@@ -31,9 +39,10 @@ def record_of(selection: Selection, evidence: SceneEvidence) -> dict[str, Any]:
         ``verdict`` (grade, reasons, next steps), ``explained_share``, ``num_predicted_matches`` (null if no
         choice had to be made), ``support``, ``contradicted_pairs``, ``misplaced_photos``, ``loose_ends``,
         ``pairs`` (verified and explained matches of every verified pair), ``models_tried``,
-        ``stopped_because`` and ``folds`` (null where too few pairs tell). The twelve least explained of
-        ``contradicted_pairs`` have ``explained_matches``: a digit for each verified match in the order of the
-        database, 1 if the model explains it, else 0.
+        ``stopped_because``, ``camera_remark`` (what the choice decided about cameras; mostly empty) and
+        ``folds`` (null where too few pairs tell). The twelve least explained of ``contradicted_pairs`` have
+        ``explained_matches``: a digit for each verified match in the order of the database, 1 if the model
+        explains it, else 0.
     """
     choice, explained = selection.choice, selection.choice.chosen.explained
     return {
@@ -71,6 +80,7 @@ def record_of(selection: Selection, evidence: SceneEvidence) -> dict[str, Any]:
             "left_out": [list(pair) for pair in selection.left_out],
         },
         "stopped_because": choice.reason,
+        "camera_remark": _CAMERA_REMARKS.get(selection.cameras, ""),
     }
 
 

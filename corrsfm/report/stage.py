@@ -85,6 +85,8 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
     models = models_of(workspace, changed) if "models" in records else []
     is_judged = "models" in records and not changed_models(workspace, changed)
     names = read_index(workspace).names
+    evidence = _read_record(workspace.evidence, changed) if is_judged else {}
+    remarks = _read_record(workspace.cameras_json, changed).get("remarks", [])
     summary = make_report(
         scene=workspace.root.resolve().name,
         image_names=names,
@@ -95,15 +97,17 @@ def summarise(workspace: Workspace) -> tuple[SceneReport, list[pycolmap.Reconstr
         stage_seconds={stage: record.seconds for stage, record in records.items()},
         configuration={stage: record.config for stage, record in records.items()},
         versions=versions(),
-        evidence=_read_record(workspace.evidence, changed) if is_judged else {},
-        camera_remarks=_read_record(workspace.cameras_json, changed).get("remarks", []),
+        evidence=evidence,
+        camera_remarks=[*remarks, *filter(None, [evidence.get("camera_remark")])],
         added=[name for name, found in read_added(workspace).items() if found["model"] is not None],
     )
     return summary, models
 
 
 # What other code takes for granted of records.
-_KINDS: dict[str, type] = {"remarks": list, "verdict": dict, "pairs": list, "joinings": list}
+_KINDS: dict[str, type] = {
+    "remarks": list, "verdict": dict, "pairs": list, "joinings": list, "camera_remark": str,
+}  # fmt: skip
 
 
 def _read_record(path: Path, changed: Collection[Path]) -> dict[str, Any]:

@@ -15,6 +15,13 @@ from corrsfm.reconstruction import best_model
 from corrsfm.reconstruction.agreement import agreement
 from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
 from corrsfm.reconstruction.calibration import Refinement
+from corrsfm.reconstruction.candidates import (
+    Candidate,
+    MapperKind,
+    StartingCameras,
+    change_cameras,
+    map_candidate,
+)
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.verdict import Grade
@@ -135,6 +142,22 @@ def test_candidates_hold_intrinsics_as_the_first_model_did(
             assert not adjustment.refine_focal_length and adjustment.refine_principal_point
         else:
             assert not options.ba_refine_focal_length and options.ba_refine_principal_point
+
+
+def test_a_model_with_a_camera_for_each_photo_gives_way_to_one_that_predicts_as_much(
+    scene: Scene, tmp_path: Path
+) -> None:
+    change_cameras(scene.database, StartingCameras.SEPARATE)
+    first = map_candidate(Candidate(mapper=MapperKind.INCREMENTAL), scene.database, tmp_path / "first")
+    assert first is not None
+    alone = scene.select(first)
+    assert alone is not None and alone.model is first
+    selected = scene.select(first, cameras_on_trial=StartingCameras.SHARED)
+    assert selected is not None and selected.cameras is StartingCameras.SHARED
+    assert len({image.camera_id for image in selected.model.images.values()}) == 1
+    assert "one camera for all photos" in record_of(selected, scene.evidence)["camera_remark"]
+    assert record_of(alone, scene.evidence)["camera_remark"] == ""
+    assert agreement(views_of(scene.truth), views_of(selected.model)).share == 1.0
 
 
 def test_nothing_is_selected_where_nothing_can_be_mapped(scene: Scene) -> None:

@@ -38,6 +38,12 @@ def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
     assert len(bank) == len({candidate.name for candidate in bank}) == 2 * 3 * 4 - 1
     assert Candidate(mapper=MapperKind.INCREMENTAL, seed=5) not in bank
     assert {candidate.seed for candidate in bank} == {5, 6}
+    assert {candidate.cameras for candidate in bank[:3]} == {StartingCameras.AS_IS}
+
+
+def test_a_shared_camera_is_tried_before_one_for_each_photo_confirms_itself() -> None:
+    bank = candidate_bank(seed=5, on_trial=StartingCameras.SHARED)
+    assert {candidate.cameras for candidate in bank[:4]} == {StartingCameras.SHARED}
 
 
 def test_other_cameras_are_tried_only_where_they_are_on_trial() -> None:
