@@ -142,6 +142,8 @@ def config_options(*, hidden: Collection[str] = (), **configs: type) -> Callable
     def decorate(command: F) -> F:
         @functools.wraps(command)
         def wrapped(*args: Any, **kwargs: Any) -> Any:
+            if idle := [flag_of(name) for name in hidden if _is_typed(name)]:
+                _warn_of(f"{', '.join(idle)}: no effect with this command")
             for keyword, cls in configs.items():
                 kwargs[keyword] = _override(cls(), kwargs)
             return command(*args, **kwargs)
@@ -253,9 +255,16 @@ def _warn_of_idle(config: Any, given: Collection[str]) -> None:
         if not set(chosen) & set(choices):
             idle.setdefault(f"--{chooser} {'+'.join(chosen)}", []).append(flag_of(entry.name))
     for choice, flags in idle.items():
-        warning = f"{', '.join(flags)}: no effect with {choice}"
-        logger.warning("%s", warning)
-        click.get_current_context().meta.setdefault(WARNED_KEY, []).append(warning)
+        _warn_of(f"{', '.join(flags)}: no effect with {choice}")
+
+
+def _warn_of(text: str) -> None:
+    logger.warning("%s", text)
+    click.get_current_context().meta.setdefault(WARNED_KEY, []).append(text)
+
+
+def _is_typed(name: str) -> bool:
+    return click.get_current_context().get_parameter_source(name) is ParameterSource.COMMANDLINE
 
 
 def run_options(command: F) -> F:

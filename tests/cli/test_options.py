@@ -97,3 +97,10 @@ def test_a_photo_in_the_place_of_a_result_is_not_replaced(
     assert result.exit_code == 1, result.output
     assert "mine.jpg: " in result.output
     assert Path("mine.jpg").read_bytes() == b"\xff\xd8\xff mine"
+
+
+def test_flags_that_a_command_takes_for_the_sake_of_scripts_are_said_to_do_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    CliRunner().invoke(main, ["reconstruct", str(tmp_path), "--verify", "--workers", "2", "--seed", "1"])
+    assert "--verify, --workers: no effect with this command" in caplog.messages
