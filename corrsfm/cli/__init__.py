@@ -18,7 +18,7 @@ from corrsfm.cli.evaluate import evaluate
 from corrsfm.cli.export import export
 from corrsfm.cli.finished import add, localize
 from corrsfm.cli.importing import import_
-from corrsfm.cli.options import OVERWRITE_KEY
+from corrsfm.cli.options import OVERWRITE_KEY, RESUME_KEY
 from corrsfm.cli.signals import interruptible
 from corrsfm.cli.stages import extract, match, pairs, prune, reconstruct, report, run
 from corrsfm.cli.surroundings import (
@@ -63,6 +63,8 @@ class _Commands(click.Group):
 
 
 def _how_to_go_on(ctx: click.Context) -> str:
+    if ctx.meta.get(RESUME_KEY) is False:
+        return "run the same command with --resume to go on"
     if ctx.meta.get(OVERWRITE_KEY):
         return "run the same command without --overwrite to go on; with it, all is done again"
     return "run the same command again to go on"

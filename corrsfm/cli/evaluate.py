@@ -206,8 +206,10 @@ def _score_lines(score: dict[str, Any]) -> Iterator[str]:
     if score["position_error_mean"] is None:
         yield "position error      undetermined: fewer than 3 registered photos, or all on a line"
         return
+    percent = score["position_error_percent"]
+    share = "" if percent is None else f" (mean {percent:.2f} % of its extent)"
     yield (
         f"position error      mean {score['position_error_mean']:.4g}, "
         f"median {score['position_error_median']:.4g}, max {score['position_error_max']:.4g} "
-        f"in units of the ground truth (mean {score['position_error_percent']:.2f} % of its extent)"
+        f"in units of the ground truth{share}"
     )

@@ -27,6 +27,7 @@ from corrsfm.files import RESULT_BEGINNING, require_replaceable, why_unusable
 __all__ = [
     "OVERWRITE_KEY",
     "PATH",
+    "RESUME_KEY",
     "WARNED_KEY",
     "config_options",
     "echo_json",
@@ -42,6 +43,8 @@ __all__ = [
 
 # Set in the context of an invocation with --overwrite.
 OVERWRITE_KEY = "corrsfm.overwrite"
+# In the context of a command that goes on only with --resume: whether that was given.
+RESUME_KEY = "corrsfm.resume"
 # In the context, what was said of options before the command began.
 WARNED_KEY = "corrsfm.warned"
 

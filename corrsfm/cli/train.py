@@ -12,6 +12,7 @@ from corrsfm.cli.options import (
     PAIR_FILE,
     PATH,
     PNG_FILE,
+    RESUME_KEY,
     config_options,
     recipe_options,
     usage_options,
@@ -87,6 +88,7 @@ def run(recipe: TrainRecipe, resume: bool, device: str, threads: int) -> None:
     from corrsfm.machine import count_threads, find_device, use_threads
     from corrsfm.training.loop import train as train_by_recipe
 
+    click.get_current_context().meta[RESUME_KEY] = resume
     use_threads(count_threads(threads))
     path = train_by_recipe(recipe, device=find_device(device), resume=resume, on_log=_echo_row)
     click.echo(str(path))

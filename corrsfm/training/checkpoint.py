@@ -57,6 +57,9 @@ class Average:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore what `state_dict` returned."""
+        shapes = {name: value.shape for name, value in state["values"].items()}
+        if shapes != {name: value.shape for name, value in self._values.items()}:
+            raise ValueError("averages of another network")
         self._num_updates = state["num_updates"]
         for name, value in state["values"].items():
             self._values[name].copy_(value)
@@ -96,8 +99,8 @@ def load_state(path: Path, device: torch.device) -> dict[str, Any]:
 def damaged_state(path: Path) -> CheckpointError:
     """The error for a state that cannot be used."""
     return CheckpointError(
-        f"{path}: damaged, or not the state of a training run; to begin that again: "
-        f"{shlex.join(['mv', str(path), f'{path}.damaged'])}"
+        f"{path}: damaged, or not the state of a training run; begin another run with another --output, from "
+        f"the last weights of this one with: {shlex.join(['--initial', str(path.with_name('latest.pt'))])}"
     )
 
 

@@ -184,6 +184,9 @@ def load_recipe(path: Path) -> TrainRecipe:
             f"{path}: unknown tables {', '.join(sorted(unknown))}; "
             "valid are train, augment, synthetic, network"
         )
+    for name, table in {"network": network, **values}.items():
+        if not isinstance(table, dict):
+            raise ConfigError(f"{path}: '{name}' must be one table, a line [{name}] and its options below it")
     return TrainRecipe(
         train=from_dict(TrainConfig, values.get("train", {}), f"{path}: train"),
         augment=from_dict(AugmentConfig, values.get("augment", {}), f"{path}: augment"),

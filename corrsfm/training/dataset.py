@@ -141,6 +141,8 @@ class RealPairs:
         parts: dict[str, list[np.ndarray]] = {}
         num_keys = num_matches = 0
         for name, scene in zip(names, scenes, strict=True):
+            if isinstance(scene, CompactScene) and not len(scene.pairs):
+                continue
             if isinstance(scene, CompactScene):
                 arrays = _flatten_scene(scene, num_keys, num_matches, match_input)
             else:

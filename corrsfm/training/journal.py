@@ -92,9 +92,12 @@ class Journal:
                 self._writer.add_scalar(f"{name}/{key}", value, row["step"])
 
 
-def described_recipe(recipe: TrainRecipe) -> dict[str, Any]:
-    """Recipe in plain values. Files by name only: checkpoints are published, paths are private."""
-    values = json.loads(json.dumps(to_dict(recipe), default=str))
+def described_recipe(recipe: TrainRecipe, *, only_result: bool = False) -> dict[str, Any]:
+    """Recipe in plain values. Files by name only: checkpoints are published, paths are private.
+
+    With ``only_result`` without options of speed and of what is logged.
+    """
+    values = json.loads(json.dumps(to_dict(recipe, only_result=only_result), default=str))
     train = recipe.train
     values["train"]["train_files"] = [path.name for path in train.train_files]
     values["train"]["output"] = train.output.name

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from statistics import fmean
@@ -104,6 +105,11 @@ def train(
                     f"{recipe.train.output}: holds a run already; try --resume or another --output"
                 )
             trainer.load()
+        elif (weights := recipe.train.output / "latest.pt").exists():
+            raise ConfigError(
+                f"{weights}: weights of a run whose state.pt is gone, so it cannot go on; choose another "
+                "--output, and --initial to begin from them"
+            )
         return trainer.run()
 
 
@@ -174,6 +180,8 @@ class Trainer:
             self._model = cast(nn.Module, torch.compile(self._model))
         self.step = self.num_skipped = 0
         self.minutes = 0.0
+        # Options that were others before a step, when the run went on with a changed recipe.
+        self.changes: list[dict[str, Any]] = []
         self._validation: Validation | None = None
         self._journal = Journal(self.config.output, tensorboard=self.config.tensorboard, on_row=on_log)
         self.state_path = self.config.output / "state.pt"
@@ -292,6 +300,8 @@ class Trainer:
             random=torch.get_rng_state(),
             network_config=json.dumps(to_dict(self.network.config)),
             input=str(self.config.input),
+            options=json.dumps(self._options()),
+            changes=json.dumps(self.changes),
         )
         save_network(self._averaged(), self.config.output / "latest.pt", provenance=self._provenance())
 
@@ -315,11 +325,37 @@ class Trainer:
                 f"{self.state_path}: the run began with input {began}, not {self.config.input}; "
                 "use another --output or the same recipe"
             )
+        if not all(_are_finite(state[name]) for name in ("network", "average", "optimiser")):
+            raise ValueError("holds numbers that are not finite")
+        if type(state["step"]) is not int or state["step"] < 0 or not math.isfinite(state["minutes"]):
+            raise ValueError("counts no steps")
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.optimiser.load_state_dict(state["optimiser"])
         torch.set_rng_state(state["random"].cpu())
         self.step, self.minutes, self.num_skipped = state["step"], state["minutes"], state["num_skipped"]
+        self.changes = json.loads(state.get("changes", "[]"))
+        options = self._options()
+        before = json.loads(state["options"]) if "options" in state else options
+        if changed := [name for name in options if before.get(name) != options[name]]:
+            logger.warning(
+                "%s: the run goes on with another recipe from step %d: %s",
+                self.config.output,
+                self.step,
+                ", ".join(f"{name} {before.get(name)} → {options[name]}" for name in changed),
+            )
+            old = {name: before.get(name) for name in changed}
+            self.changes.append({"before_step": self.step, "options": old})
+
+    def _options(self) -> dict[str, Any]:
+        """The options that decide about the weights, by table and name; files by name only."""
+        tables = described_recipe(self.recipe, only_result=True)
+        return {
+            f"{table}.{name}": value
+            for table, options in tables.items()
+            for name, value in options.items()
+            if name not in ("output", "val_file")
+        }
 
     def validate(self) -> dict[str, Any] | None:
         """Score the averaged weights on the validation pairs, and append a row to ``validation.csv``."""
@@ -372,8 +408,18 @@ class Trainer:
             "minutes": round(self.minutes, 1),
             "seed": self.config.seed,
             "recipe": described_recipe(self.recipe),
+            **({"changes": self.changes} if self.changes else {}),
             **hardware(self.device),
         }
+
+
+def _are_finite(values: Any) -> bool:
+    """Whether all tensors in nested values are finite."""
+    if isinstance(values, Mapping):
+        return all(map(_are_finite, values.values()))
+    if isinstance(values, list | tuple):
+        return all(map(_are_finite, values))
+    return not isinstance(values, Tensor) or bool(values.isfinite().all())
 
 
 def _parameter_groups(network: nn.Module, weight_decay: float) -> list[dict[str, Any]]:

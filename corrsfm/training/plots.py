@@ -31,10 +31,12 @@ def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, 
     return figure, np.atleast_1d(figure.subplots(rows, columns)).reshape(-1)
 
 
-def _read_columns(path: Path) -> dict[str, NDArray[np.float64]]:
+def _read_columns(path: Path, needed: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     try:
         with io.TextIOWrapper(open_file(path), encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
+        if rows and (missing := [name for name in needed if name not in rows[0]]):
+            raise ValueError(f"no column {', '.join(missing)}")
         return (
             {name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0]} if rows else {}
         )
@@ -49,9 +51,11 @@ def _save(figure: Any, output: Path, dpi: int) -> None:
 
 def plot_learning_curves(run_folder: Path, output: Path) -> None:
     """Draw losses, learning rate and validation scores of a run into a PNG."""
-    log = _read_columns(Path(run_folder) / "log.csv")
+    losses = ("step", "classification", "essential", "learning_rate")
+    log = _read_columns(Path(run_folder) / "log.csv", losses)
     validation_path = Path(run_folder) / "validation.csv"
-    validation = _read_columns(validation_path) if validation_path.exists() else {}
+    scores = ("step", "auc5", "auc10", "auc20", "baseline_auc5")
+    validation = _read_columns(validation_path, scores) if validation_path.exists() else {}
     if not log:
         raise InputError(f"{run_folder}: its log is empty; train for longer")
     figure, axes = _figure(1, 4, 17, 3.6)

@@ -2,11 +2,15 @@
 
 from pathlib import Path
 
+import pytest
 from click.testing import CliRunner
 
 from corrsfm.cli import main
 from corrsfm.config import MatchInput, NetworkUsage
+from corrsfm.errors import ConfigError, InputError
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network, read_provenance, save_network
+from corrsfm.training.config import load_recipe
+from corrsfm.training.plots import plot_learning_curves
 
 
 def test_a_run_without_training_files_names_the_options_for_them() -> None:
@@ -43,3 +47,16 @@ def test_export_keeps_what_a_checkpoint_says_but_for_the_flags_given(tmp_path: P
     command = ["train", "export", str(tmp_path / "silent.pt"), str(tmp_path / "x.pt"), "--sfm-min-score", "3"]
     result = CliRunner().invoke(main, command)
     assert result.exit_code == 1 and "sfm_min_score is 3.0, expected at most 1" in result.stderr
+
+
+@pytest.mark.parametrize("text", ["train = 1", "[[train]]", "network = 1", "[[network]]"])
+def test_a_recipe_whose_tables_are_none_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "r.toml").write_text(text + "\n")
+    with pytest.raises(ConfigError, match="must be one table"):
+        load_recipe(tmp_path / "r.toml")
+
+
+def test_the_log_of_another_program_has_no_curves(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"log\.csv: is damaged \(no column step, "):
+        plot_learning_curves(tmp_path, tmp_path / "c.png")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 import math
 from types import SimpleNamespace
 
@@ -131,6 +132,38 @@ def test_run_from_files_writes_a_network_that_says_where_it_comes_from(tmp_path)
     with pytest.raises(ConfigError, match="holds a run already; try --resume"):
         train(recipe, device=CPU)
     assert train(recipe, device=CPU, resume=True) == path
+    (tmp_path / "run" / "state.pt").unlink()
+    with pytest.raises(ConfigError, match=r"latest\.pt: weights of a run whose state\.pt is gone"):
+        train(recipe, device=CPU, resume=True)
+    assert read_provenance(path) == provenance
+
+
+def test_a_run_that_goes_on_with_another_recipe_says_so_and_records_it(data, tmp_path, caplog):
+    Trainer(make_recipe(tmp_path / "run", max_steps=2), data, CPU).run()
+    again = Trainer(make_recipe(tmp_path / "run", max_steps=2, log_every=3), data, CPU)
+    again.load()
+    assert not caplog.messages and not again.changes
+    other = Trainer(make_recipe(tmp_path / "run", max_steps=3, learning_rate=0.5), data, CPU)
+    other.load()
+    assert "goes on with another recipe from step 2" in caplog.text and "→ 0.5" in caplog.text
+    other.run()
+    (change,) = json.loads((tmp_path / "run" / "recipe.json").read_text())["changes"]
+    assert change["before_step"] == 2 and change["options"]["train.max_steps"] == 2
+    assert read_provenance(tmp_path / "run" / "latest.pt")["changes"] == [change]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("step", -5), ("step", "x"), ("minutes", math.nan), ("average", {}), ("network", None)],
+)
+def test_a_state_that_no_run_leaves_is_damaged(data, tmp_path, name, value):
+    Trainer(make_recipe(tmp_path, max_steps=1), data, CPU).run()
+    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    if name == "network":
+        value = {key: tensor * torch.nan for key, tensor in state["network"].items()}
+    torch.save({**state, name: value}, tmp_path / "state.pt")
+    with pytest.raises(CheckpointError, match=r"state\.pt: damaged, or not the state.*--initial"):
+        Trainer(make_recipe(tmp_path, max_steps=2), data, CPU).load()
 
 
 def test_steps_that_are_not_finite_are_counted_and_change_nothing(data, tmp_path):
@@ -211,12 +244,12 @@ def test_resuming_another_network_is_refused(data, tmp_path):
 def test_a_state_of_another_kind_is_refused(tmp_path, content):
     path = tmp_path / "state.pt"
     torch.save({"format": "other"}, path) if content is None else path.write_bytes(content)
-    with pytest.raises(CheckpointError, match=f"not the state of .*: mv {path} {path}.damaged"):
+    with pytest.raises(CheckpointError, match=f"not the state of .*: --initial {tmp_path}/latest.pt"):
         load_state(path, CPU)
 
 
 @pytest.mark.parametrize("name", ["network", "optimiser", "random", "step"])
-def test_a_damaged_state_can_be_removed_to_begin_again(tmp_path, name):
+def test_of_a_run_whose_state_is_damaged_another_begins_with_its_weights(tmp_path, name):
     write_scenes(tmp_path / "train.h5", [make_scene("a")])
     recipe = make_recipe(tmp_path / "run", max_steps=2, train_files=(tmp_path / "train.h5",))
     train(recipe, device=CPU)
@@ -227,10 +260,11 @@ def test_a_damaged_state_can_be_removed_to_begin_again(tmp_path, name):
     else:
         del state[name]
     torch.save(state, path)
-    with pytest.raises(CheckpointError, match=f"damaged.*: mv {path} {path}.damaged"):
+    latest = path.with_name("latest.pt")
+    with pytest.raises(CheckpointError, match=f"damaged.*another --output.*: --initial {latest}"):
         train(recipe, device=CPU, resume=True)
-    path.unlink()
-    train(recipe, device=CPU)
+    train(make_recipe(tmp_path / "other", max_steps=2, train_files=recipe.train.train_files,
+                      initial=str(latest)), device=CPU)  # fmt: skip
 
 
 def test_the_folder_of_a_run_is_for_one_run_alone(tmp_path):

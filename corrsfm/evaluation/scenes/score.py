@@ -171,13 +171,16 @@ def _read_camera(path: Path) -> Pose:
         values = read_json(path)
         rotation = np.array(values["rotation"], np.float64).reshape(3, 3)
         translation = np.array(values["translation"], np.float64).reshape(3)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
         raise InputError(
             f"{path}: not a camera file ({lack_or_text(error)}); expected 'rotation' (3 × 3) and "
             "'translation' (3) of cam_from_world"
         ) from error
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) or np.linalg.det(rotation) < 0:
         raise InputError(f"{path}: 'rotation' is not a rotation matrix; expected cam_from_world, rows first")
+    # Squares of larger numbers, whatever their unit, are infinite.
+    if not (np.abs(translation) < 1e100).all():
+        raise InputError(f"{path}: 'translation' is {translation}; expected three finite numbers")
     return rotation, translation
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.config import FeaturesConfig, to_dict
+from corrsfm.config import FeaturesConfig, config_hash, to_dict
 from corrsfm.errors import InputError
 from corrsfm.evaluation.metrics import homography_corner_error, pose_auc
 from corrsfm.evaluation.records import (
@@ -27,6 +27,7 @@ from corrsfm.evaluation.records import (
     save_results,
 )
 from corrsfm.evaluation.two_view.filters import PairFilter, parse_filter
+from corrsfm.files import read_text, sha256_of
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import Camera, Features, PruneResult
 
@@ -100,9 +101,13 @@ def _image_path(sequence: Path, number: int) -> Path:
 
 def _read_homography(path: Path) -> NDArray[np.float64]:
     try:
-        return np.loadtxt(path).reshape(3, 3)
-    except (OSError, ValueError) as error:
+        text = read_text(path)
+        homography = np.array(text.split(), np.float64).reshape(3, 3)
+    except ValueError as error:
         raise InputError(f"{path}: not a homography ({error}); expected 3 × 3 numbers") from error
+    if not np.isfinite(homography).all() or np.linalg.matrix_rank(homography) < 3:
+        raise InputError(f"{path}: not a homography; expected 3 × 3 finite numbers that can be inverted")
+    return homography
 
 
 def _unit_camera(size: tuple[int, int]) -> Camera:
@@ -124,7 +129,11 @@ def load_sequence(sequence: Path, features: FeaturesConfig = HOMOGRAPHY_FEATURES
     from corrsfm.images.photos import read_image
 
     extract = create_extractor(features)
-    numbers = sorted(int(path.name.rpartition("_")[2]) for path in sequence.glob("H_1_*"))
+    numbers = sorted(
+        int(path.name.removeprefix("H_1_"))
+        for path in sequence.glob("H_1_*")
+        if path.name.removeprefix("H_1_").isdecimal()
+    )
     first = extract(read_image(_image_path(sequence, 1)), None)
     pairs = []
     for number in numbers:
@@ -252,6 +261,7 @@ def evaluate_homography(
     subject = {
         "name": folder.name,
         "sequences": [sequence.name for sequence in sequences],
+        "sha256": _content(sequences),
         "features": to_dict(features),
     }
 
@@ -277,6 +287,12 @@ def evaluate_homography(
     if results is not None:
         save_results(results, "homography", values)
     return values
+
+
+def _content(sequences: Sequence[Path]) -> str:
+    """Hash of all photos and homographies."""
+    files = [path for sequence in sequences for path in sorted(sequence.iterdir()) if path.is_file()]
+    return config_hash([[path.parent.name, path.name, sha256_of(path)] for path in files])
 
 
 def _measure(

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from corrsfm.cli import main
+from corrsfm.cli.evaluate import _score_lines
 from corrsfm.errors import InputError
 from corrsfm.evaluation.scenes.score import evaluate_scene, find_model, read_poses, score_poses
 
@@ -121,11 +122,23 @@ def test_what_cannot_be_compared_is_explained(truth_dir: Path, tmp_path: Path):
     (tmp_path / "b.jpg.json").write_text("{}")
     with pytest.raises(InputError, match=r"b\.jpg\.json: not a camera file \(lacks 'rotation'\)"):
         read_poses(tmp_path)
+    for impossible in (float("nan"), float("inf"), None, 1e300, 10**400):
+        (tmp_path / "b.jpg.json").write_text(json.dumps({**camera, "translation": [0, impossible, 0]}))
+        with pytest.raises(InputError, match=r"b\.jpg\.json: "):
+            read_poses(tmp_path)
     (tmp_path / "workspace.json").write_text("{}")
     with pytest.raises(InputError, match="for a workspace run: corrsfm reconstruct"):
         read_poses(tmp_path)
     shutil.copytree(truth_dir, tmp_path / "sparse" / "0")
     assert read_poses(tmp_path).keys() == read_poses(truth_dir).keys()
+
+
+def test_known_cameras_of_one_place_have_no_share_of_an_extent() -> None:
+    values = {
+        "num_registered": 3, "num_photos": 3, "auc": {"5": 90.0}, "position_error_mean": 0.1,
+        "position_error_median": 0.1, "position_error_max": 0.2, "position_error_percent": None,
+    }  # fmt: skip
+    assert list(_score_lines(values))[-1].endswith("in units of the ground truth")
 
 
 def test_command_prints_the_score(truth_dir: Path, tmp_path: Path):

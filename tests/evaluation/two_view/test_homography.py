@@ -1,5 +1,6 @@
 """Homography evaluation on a small made-up folder: one texture warped by known homographies."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,11 @@ def test_second_run_measures_only_what_is_new(folder: Path, tmp_path: Path):
     )
     assert seen == ["i_plane", "v_plane"]
     assert set(load_results(results)["methods"]) == {"nn", "oracle"}
+    changed = tmp_path / "changed" / folder.name
+    shutil.copytree(folder, changed)
+    _write(changed / "v_plane" / "2.ppm", np.full((240, 320), 128, np.uint8))
+    with pytest.raises(InputError, match="measured on"):
+        evaluate_homography(changed, ["oracle"], results=results)
 
 
 def test_no_matches_is_a_failure_not_a_crash(tmp_path: Path):
@@ -118,8 +124,11 @@ def test_folders_that_are_no_hpatches_are_explained(tmp_path: Path):
         load_sequence(tmp_path / "v_a")
     for number in (1, 2):
         _write(tmp_path / "v_a" / f"{number}.png", _texture())
-    with pytest.raises(InputError, match=r"H_1_2: not a homography"):
-        load_sequence(tmp_path / "v_a")
+    (tmp_path / "v_a" / "H_1_2~").write_text("a backup")
+    for text in ("1 2 3", "nan " * 9, "0 " * 9, "1 2 3 " * 3, "x " * 9):
+        (tmp_path / "v_a" / "H_1_2").write_text(text)
+        with pytest.raises(InputError, match=r"H_1_2: not a homography"):
+            load_sequence(tmp_path / "v_a")
 
 
 def test_command_prints_the_table(folder: Path, tmp_path: Path):
