@@ -108,6 +108,12 @@ class PruneMethod(StrEnum):
             return None
         return str(PruneMethod.CORRADAPTOR if self is PruneMethod.CASCADE else self)
 
+    @property
+    def bundled(self) -> str | None:
+        """The name of the checkpoint that it asks if none is given; None if it asks none or needs one."""
+        bundled = {"corradaptor": "small-mutual", "oanet": "small-oanet"}
+        return bundled.get(self.architecture or "")
+
 
 class OperatingPoint(StrEnum):
     """How strict the learned pruner is."""
@@ -260,12 +266,13 @@ class PruneConfig:
     # The best on the validation scenes, see results/pose_val_scenes.json.
     method: PruneMethod = option(
         PruneMethod.CORRADAPTOR,
-        "How putative matches are pruned: none to magsac without a network, corradaptor and cascade with the "
-        "bundled one, all others with a network of yours (--model)",
+        "How putative matches are pruned: none to magsac without a network, corradaptor, cascade and oanet "
+        "with a bundled one, all others with a network of yours (--model)",
     )
     model: Path | None = option(
         None,
-        "Network checkpoint, or name of a bundled one; small-mutual, which is for SIFT, if not given",
+        "Network checkpoint, or name of a bundled one; if not given, small-mutual, or for oanet small-oanet, "
+        "both for SIFT",
         used_with=_NETWORK,
     )
     operating_point: OperatingPoint = option(

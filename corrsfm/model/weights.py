@@ -27,7 +27,7 @@ from typing import Any, Literal, Union, get_origin, get_type_hints, overload
 import torch
 from torch import Tensor, nn
 
-from corrsfm.config import NetworkUsage, from_dict, to_dict
+from corrsfm.config import NetworkUsage, PruneMethod, from_dict, to_dict
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.files import atomic_path, sha256_of
 from corrsfm.model.network import CorrAdaptor, NetworkConfig
@@ -43,7 +43,7 @@ from corrsfm.model.rivals.checkpoints import (
 )
 
 __all__ = [
-    "DEFAULT_CHECKPOINT",
+    "DEFAULT_CHECKPOINTS",
     "FORMAT",
     "REGISTRY",
     "BundledCheckpoint",
@@ -78,7 +78,7 @@ class BundledCheckpoint:
     """File name below ``corrsfm/model/checkpoints``."""
     sha256: str
     """Hash of the file."""
-    config: NetworkConfig
+    config: NetworkConfig | RivalConfig
     """Architecture."""
     licence: str
     """Licence of the weights."""
@@ -86,6 +86,11 @@ class BundledCheckpoint:
     """What it was trained on."""
     score: str
     """Measured result, with the data it was measured on."""
+
+    @property
+    def architecture(self) -> str:
+        """The network, as `load_network` calls it."""
+        return self.config.architecture if isinstance(self.config, RivalConfig) else CORRADAPTOR
 
 
 _SMALL = NetworkConfig(
@@ -120,12 +125,23 @@ REGISTRY: dict[str, BundledCheckpoint] = {
             training_data="1,882 pairs of 54 photo scenes with COLMAP poses; the model card names them",
             score="AUC@5° 49.7 against 51.3 of mutual and 44.3 of ratio + mutual, 135 validation pairs",
         ),
+        BundledCheckpoint(
+            name="small-oanet",
+            file="small-oanet.pt",
+            sha256="25ccdefbd56eda230e507ed2bcaf4b2d78c93f2f97f61e963462eb88ff8cc8b7",
+            config=RivalConfig(architecture="oanet", channels=32, clusters=48, side_channels=5),
+            licence="Apache-2.0",
+            training_data="pairs of 54 photo scenes with COLMAP poses; the model card says which",
+            score="AUC@5° 72.7 against 68.9 of ratio + mutual, 240 validation pairs, 4,096 keypoints",
+        ),
     )
 }
 """Bundled checkpoints by name."""
 
-DEFAULT_CHECKPOINT = "small-mutual"
-"""Name of the checkpoint that is loaded by default."""
+DEFAULT_CHECKPOINTS = {
+    str(method): method.bundled for method in PruneMethod if method.bundled and method.architecture == method
+}
+"""Architecture → name of the checkpoint that is loaded for it by default."""
 
 
 def build_network(config: NetworkConfig | RivalConfig) -> CorrAdaptor | Rival:
@@ -162,7 +178,8 @@ def load_network(
     Parameters
     ----------
     path : path or str, optional
-        A checkpoint of any format, or the name of a bundled one. The default bundled one if not given.
+        A checkpoint of any format, or the name of a bundled one. The bundled one of the architecture if not
+        given, which is then ``corradaptor`` by default.
     architecture : str, optional
         Refuse any other network: ``corradaptor`` or one of `corrsfm.model.rivals.ARCHITECTURES`. Recognised
         from the tensors' names where it is not given.
@@ -172,8 +189,8 @@ def load_network(
     Raises
     ------
     CheckpointError
-        If the file is missing, damaged, of another format or of another network; missing and unexpected keys
-        are listed. If a bundled file is not the one that was released.
+        If the file is missing, damaged, of another format or of another network, or none of this network is
+        bundled; missing and unexpected keys are listed. If a bundled file is not the one that was released.
     ConfigError
         If there is no such architecture.
     """
@@ -181,7 +198,7 @@ def load_network(
         raise ConfigError(
             f"architecture is {architecture!r}, expected one of {', '.join([CORRADAPTOR, *ARCHITECTURES])}"
         )
-    file, released_sha256 = _locate(path)
+    file, released_sha256 = _locate(path, architecture)
     content = _read(file, map_location, expected_sha256=released_sha256)
     state: Any
     network: CorrAdaptor | Rival
@@ -271,7 +288,7 @@ def read_provenance(path: Path | str | None = None) -> dict[str, Any]:
     return provenance
 
 
-def checkpoint_sha256(path: Path | str | None = None) -> str:
+def checkpoint_sha256(path: Path | str | None = None, architecture: str | None = None) -> str:
     """Hash of a checkpoint, given as for `load_network`.
 
     Raises
@@ -279,13 +296,17 @@ def checkpoint_sha256(path: Path | str | None = None) -> str:
     CheckpointError
         If the checkpoint does not exist.
     """
-    file, released_sha256 = _locate(path)
+    file, released_sha256 = _locate(path, architecture)
     return released_sha256 or sha256_of(file)
 
 
-def _locate(path: Path | str | None) -> tuple[Path, str | None]:
+def _locate(path: Path | str | None, architecture: str | None = None) -> tuple[Path, str | None]:
     """File of a checkpoint, and the hash that it was released with if it is a bundled one."""
-    bundled = REGISTRY.get(str(path or DEFAULT_CHECKPOINT))
+    if path is None:
+        path = DEFAULT_CHECKPOINTS.get(architecture or CORRADAPTOR)
+        if path is None:
+            raise CheckpointError(f"no weights of the network {architecture} come with corrsfm; give a file")
+    bundled = REGISTRY.get(str(path))
     file = CHECKPOINT_DIR / bundled.file if bundled else Path(str(path))
     if not file.is_file():
         names = ", ".join(REGISTRY)

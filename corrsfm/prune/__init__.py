@@ -169,12 +169,12 @@ def checkpoint_sha256(config: PruneConfig) -> str | None:
     from corrsfm.model import weights
 
     _require_weights(config)
-    return weights.checkpoint_sha256(config.model)
+    return weights.checkpoint_sha256(config.model, config.method.architecture)
 
 
 def _require_weights(config: PruneConfig) -> None:
     """Check that a config names weights where none come with the package."""
-    if config.model is None and config.method.architecture != PruneMethod.CORRADAPTOR:
+    if config.model is None and config.method.bundled is None:
         raise ConfigError(
             f"--method {config.method}: no weights of this network come with corrsfm; give a checkpoint, "
             f"published or trained with `corrsfm train`, by --model FILE ({config.method}:FILE in a list of "
@@ -203,7 +203,7 @@ def _load_network_pruner(
     )
     if traits is None:
         return pruner
-    name = config.model or weights.DEFAULT_CHECKPOINT
+    name = config.model or config.method.bundled
     missing = missing_channels(
         pruner.side_channels, has_shapes=traits.has_shapes, has_ratios=traits.has_ratios
     )
@@ -213,10 +213,11 @@ def _load_network_pruner(
             fitting = [
                 row.name
                 for row in weights.REGISTRY.values()
-                if not missing_channels(row.config.side_channels, has_shapes=False, has_ratios=True)
+                if row.architecture == config.method.architecture
+                and not missing_channels(row.config.side_channels, has_shapes=False, has_ratios=True)
             ]
             advice = "use --method loransac"
-            if config.method.architecture == PruneMethod.CORRADAPTOR:
+            if fitting:
                 advice += f", or --model {' or '.join(fitting)}"
         raise CheckpointError(
             f"{name}: this network reads {missing}, which {traits.features} features and their matches here "

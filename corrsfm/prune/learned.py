@@ -188,8 +188,8 @@ class Pruner:
         Parameters
         ----------
         path : Path or str, optional
-            Checkpoint in this project's or the published format, or the name of a bundled one; that for SIFT
-            if not given.
+            Checkpoint in this project's or the published format, or the name of a bundled one; that of the
+            architecture for SIFT if not given.
         architecture : str
             The network that it must hold, as for `corrsfm.model.load_network`.
         device : str
@@ -208,7 +208,8 @@ class Pruner:
                 f"{path}: this network reads {network.side_channels} side channels, and corrsfm computes "
                 f"{' or '.join(map(str, SIDE_LAYOUTS))}; train one that reads as many"
             )
-        return cls(network, checkpoint_sha256=weights.checkpoint_sha256(path), device=device, **options)
+        sha256 = weights.checkpoint_sha256(path, architecture)
+        return cls(network, checkpoint_sha256=sha256, device=device, **options)
 
     def __call__(self, pairs: Sequence[Correspondences]) -> list[PruneResult]:
         """Prune pairs; see `corrsfm.prune.PrunerProtocol`.

@@ -194,7 +194,7 @@ def bundle(monkeypatch, path, sha256: str) -> None:
     )
     monkeypatch.setattr(weights, "CHECKPOINT_DIR", path.parent)
     monkeypatch.setattr(weights, "REGISTRY", {"test": row})
-    monkeypatch.setattr(weights, "DEFAULT_CHECKPOINT", "test")
+    monkeypatch.setattr(weights, "DEFAULT_CHECKPOINTS", {"corradaptor": "test"})
 
 
 def test_bundled_checkpoint_loads_by_default_and_by_name(monkeypatch, checkpoint):
@@ -215,8 +215,14 @@ def test_bundled_checkpoint_with_another_hash_is_refused(monkeypatch, checkpoint
         load_network()
 
 
+def test_a_network_without_bundled_weights_needs_a_file():
+    with pytest.raises(CheckpointError, match="no weights of the network clnet come with corrsfm"):
+        load_network(architecture="clnet")
+
+
 def test_every_registered_checkpoint_is_what_it_says():
-    assert weights.DEFAULT_CHECKPOINT in weights.REGISTRY
+    for architecture, name in weights.DEFAULT_CHECKPOINTS.items():
+        assert weights.REGISTRY[name].architecture == architecture
     for name, row in weights.REGISTRY.items():
         assert name == row.name
         assert load_network(name).config == row.config

@@ -1,17 +1,29 @@
 """Rival networks as prune methods: scores for all matches, batches like single pairs, clear refusals."""
 
+import dataclasses
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from rival_weights import drawn_rival
 from two_view_pairs import make_pair
 
-from corrsfm.config import MatchInput, NetworkUsage, OperatingPoint, Precision, PruneConfig, PruneMethod
+from corrsfm.config import (
+    FeatureKind,
+    MatchInput,
+    MatchTraits,
+    NetworkUsage,
+    OperatingPoint,
+    Precision,
+    PruneConfig,
+    PruneMethod,
+)
 from corrsfm.errors import CheckpointError, ConfigError
 from corrsfm.evaluation.two_view.filters import parse_prune_method
 from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.model.rivals import ARCHITECTURES, RivalConfig, build_rival
-from corrsfm.model.weights import load_network, save_network
+from corrsfm.model.weights import REGISTRY, load_network, save_network
 from corrsfm.prune import Pruner, build_pruner, checkpoint_sha256
 from corrsfm.prune.correspondences import SIDE_LAYOUTS
 
@@ -82,6 +94,18 @@ def test_a_checkpoint_keeps_what_a_rival_reads_and_how_strict_it_is(tmp_path):
         {"state_dict": build_rival(RivalConfig(architecture="lmcnet")).state_dict()}, tmp_path / "l.pth"
     )
     assert load_network(tmp_path / "l.pth").usage.pose_min_score == 0.95
+
+
+def test_oanet_comes_with_weights():
+    pruner = build_pruner(PruneConfig(method=PruneMethod.OANET), device="cpu")
+    assert pruner.name == "oanet"
+    config = PruneConfig(method=PruneMethod.OANET)
+    assert checkpoint_sha256(config) == REGISTRY["small-oanet"].sha256
+    named = dataclasses.replace(config, model=Path("small-oanet"))
+    assert build_pruner(named, device="cpu").fingerprint == pruner.fingerprint
+    lacking = MatchTraits(features=FeatureKind.ALIKED, has_shapes=False)
+    with pytest.raises(CheckpointError, match=r"small-oanet: this network reads .*; use --method loransac$"):
+        build_pruner(config, traits=lacking, device="cpu")
 
 
 def test_what_does_not_fit_is_refused_before_any_work(tmp_path):

@@ -112,7 +112,7 @@ def make_base(folder: Path) -> None:
     from sandbox import call
 
     from corrsfm.labelled.compact import write_scenes
-    from corrsfm.model.weights import CHECKPOINT_DIR, DEFAULT_CHECKPOINT
+    from corrsfm.model.weights import CHECKPOINT_DIR, DEFAULT_CHECKPOINTS
 
     folder = folder.resolve()
     render_photos(folder / "photos")
@@ -136,7 +136,7 @@ def make_base(folder: Path) -> None:
     write_scenes(folder / "pairs.h5", [make_scene()])
     wall = cv2.imread(str(folder / "photos" / "0.jpg"))
     assert cv2.imwrite(str(folder / "wall.ppm"), wall)
-    shutil.copy(CHECKPOINT_DIR / f"{DEFAULT_CHECKPOINT}.pt", folder / "net.pt")
+    shutil.copy(CHECKPOINT_DIR / f"{DEFAULT_CHECKPOINTS['corradaptor']}.pt", folder / "net.pt")
 
 
 def _make_imported(folder: Path) -> None:
