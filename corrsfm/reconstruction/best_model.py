@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -267,9 +268,11 @@ def select_model(
         start, others = None, []
         if first is not None:
             start = tried(FIRST, first, first_seconds)
-            # With a camera for each photo a wrong model explains nearly everything, too.
+            # With a camera for each photo a wrong model explains nearly everything, too. Photos of many
+            # sizes, as from many people, are mapped again only if their focal lengths are open.
             if cameras_on_trial is StartingCameras.SHARED:
-                start = dataclasses.replace(start, is_open=True, has_more_cameras=True)
+                is_open = _are_mostly_of_one_size(first) or _has_large_slack(first)
+                start = dataclasses.replace(start, is_open=is_open, has_more_cameras=True)
         while start is None and bank and policy.max_models > 1:
             candidates, bank = bank[: policy.round_size], bank[policy.round_size :]
             others = map_round(candidates)
@@ -302,6 +305,18 @@ def select_model(
         folds=attempt.evidence,
         cameras=cameras_of.get(choice.chosen.name, StartingCameras.AS_IS),
     )
+
+
+def _has_large_slack(model: pycolmap.Reconstruction) -> bool:
+    slack = measure_focal_slack(model)
+    return slack is not None and slack.is_large
+
+
+def _are_mostly_of_one_size(model: pycolmap.Reconstruction) -> bool:
+    """Whether half of the photos of a model, or more, have one size and no known focal length."""
+    cameras = [image.camera for image in model.images.values() if image.has_pose]
+    sizes = Counter((one.width, one.height) for one in cameras if not one.has_prior_focal_length)
+    return 2 * max(sizes.values(), default=0) >= len(cameras)
 
 
 def _unfolded(

@@ -152,6 +152,12 @@ def test_a_model_with_a_camera_for_each_photo_gives_way_to_one_that_predicts_as_
     assert first is not None
     alone = scene.select(first)
     assert alone is not None and alone.model is first
+    # Photos of as many sizes are taken for those of as many people.
+    several = pycolmap.Reconstruction(first)
+    for number, camera in enumerate(several.cameras.values()):
+        camera.width += 2 * number
+    kept = scene.select(several, cameras_on_trial=StartingCameras.SHARED)
+    assert kept is not None and kept.model is several
     selected = scene.select(first, cameras_on_trial=StartingCameras.SHARED)
     assert selected is not None and selected.cameras is StartingCameras.SHARED
     assert len({image.camera_id for image in selected.model.images.values()}) == 1
