@@ -250,6 +250,8 @@ def _decode(name: str, group: h5py.Group) -> CompactScene:
     )
     longest = np.repeat(sizes.max(axis=1, initial=1), np.diff(offsets))
     num_matches = len(stored["neighbours"])
+    if len(stored["mutual"]) != -(-num_matches // 8):
+        raise ValueError("mutual has not one flag a match")
     log_scales = stored["log_scales"].astype(np.float32)
     # The cast to a signed integer puts the angle in [-π, π).
     angles = (stored["orientations"].astype(np.int16) * (2.0 * np.pi / 65536.0)).astype(np.float32)
@@ -350,6 +352,10 @@ def _check_numbers(scene: CompactScene) -> None:
         raise ValueError("arrays do not fit each other")
     if not (np.isfinite(scene.rotations).all() and np.isfinite(scene.translations).all()):
         raise ValueError("a pose is not finite")
+    if not np.allclose(scene.rotations @ scene.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-3):
+        raise ValueError("a rotation is none")
+    if (scene.pairs[:, 0] == scene.pairs[:, 1]).any():
+        raise ValueError("a photo is paired with itself")
     if not np.isfinite(scene.corrections).all() or np.isinf(scene.log_scales).any():
         raise ValueError("a correction or scale of a keypoint is not finite")
     if ((scene.pairs < 0) | (scene.pairs >= num_images)).any():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 from pathlib import Path
 
 import h5py
@@ -84,6 +85,26 @@ def test_a_file_tells_features_without_scale(written, tmp_path):
     none = np.full(len(scene.log_scales), np.nan, np.float32)
     write_scenes(tmp_path / "aliked.h5", [dataclasses.replace(scene, log_scales=none)])
     assert lacks_shapes(tmp_path / "aliked.h5")
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "problem"),
+    [
+        ("mutual", lambda values: values[:-1], "not one flag a match"),
+        ("rotations", lambda values: 2.0 * values, "a rotation is none"),
+        ("pairs", lambda values: np.repeat(values[:, :1], 2, axis=1), "paired with itself|one neighbour"),
+    ],
+)
+def test_values_that_cannot_be_are_damage(written, tmp_path, name, change, problem):
+    path = tmp_path / "pairs.h5"
+    shutil.copy(written[0], path)
+    with h5py.File(path, "r+") as file:
+        group = file[sorted(file)[0]]
+        values = change(group[name][()])
+        del group[name]
+        group[name] = values
+    with pytest.raises(InputError, match=f"is damaged .*({problem})"):
+        read_scenes(path)
 
 
 def test_a_file_of_another_kind_is_refused(tmp_path):

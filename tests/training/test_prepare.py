@@ -130,7 +130,7 @@ def test_a_workspace_is_a_scene(small_scene, tmp_path):
     for name in ("cameras.txt", "images.txt", "points3D.txt"):
         (model / name).write_text((small_scene / name).read_text())
     # Without covisibility.txt the pairs are those that share points of the model; this one has none.
-    with pytest.raises(InputError, match="no pair of photos"):
+    with pytest.raises(InputError, match="no two photos from different places share"):
         prepare_scene(tmp_path / "work", CONFIG)
     (tmp_path / "work" / "covisibility.txt").write_text((small_scene / "covisibility.txt").read_text())
     assert len(prepare_scene(tmp_path / "work", CONFIG).pairs) == 3

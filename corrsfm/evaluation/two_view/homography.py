@@ -34,6 +34,7 @@ from corrsfm.types import Camera, Features, PruneResult
 __all__ = ["HOMOGRAPHY_FEATURES", "HomographyPair", "evaluate_homography", "list_sequences", "load_sequence"]
 
 CORNER_THRESHOLDS_PX = (3.0, 5.0, 10.0)
+_KEYS = tuple(f"{threshold:g}" for threshold in CORNER_THRESHOLDS_PX)
 REFERENCE_SIDE_PX = 480.0
 RANSAC_THRESHOLD_PX = 3.0
 _CONFIDENCE = 0.99999
@@ -265,8 +266,14 @@ def evaluate_homography(
         "features": to_dict(features),
     }
 
-    def read(entry: dict[str, Any]) -> list[Any]:
-        return [entry["summary"][name] for name in ("num_failed", "num_kept", "auc", "auc_interval")]
+    def read(entry: dict[str, Any]) -> None:
+        summary = entry["summary"]
+        numbers = [summary["num_failed"], summary["num_kept"], *map(summary["auc"].__getitem__, _KEYS)]
+        for name in _KEYS:
+            mean, low, high = summary["auc_interval"][name]
+            numbers += [mean, low, high]
+        if not all(type(number) in (int, float) for number in numbers):
+            raise ValueError("a score is no number")
 
     entries = kept_methods(results, "homography", subject, read, overwrite=overwrite)
     missing = [f for f in built if entries.get(f.name, {}).get("fingerprint") != f.fingerprint]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -321,6 +321,7 @@ def evaluate_pose(
 
     old = kept_methods(results, "pose", subject.description, read, overwrite=overwrite)
     entries: dict[str, Any] = dict(old)
+    _require_measured(baseline, [*old, *(method.name for method in built)])
     groups: dict[str, list[TwoViewMethod]] = {}
     for method in built:
         if not (method.name in old and old[method.name]["fingerprint"] == method.fingerprint):
@@ -342,6 +343,15 @@ def evaluate_pose(
     return _write(results, subject, entries, baseline, seed, command, device)
 
 
+def _require_measured(baseline: str | None, names: Collection[str]) -> None:
+    """Check, before hours of measuring, that differences can refer to the baseline."""
+    if baseline is not None and baseline not in names:
+        raise ConfigError(
+            f"baseline '{baseline}' is none of the methods to measure: {', '.join(names)}; if it is a "
+            "FILTER/ESTIMATOR, add it by another --method"
+        )
+
+
 def _write(
     results: Path | None,
     subject: _Subject,
@@ -353,8 +363,6 @@ def _write(
 ) -> dict[str, Any]:
     """Summarise all methods, and write the result file if there is one."""
     baseline = baseline or next(iter(entries))
-    if baseline not in entries:
-        raise ConfigError(f"baseline '{baseline}' was not measured; add it as --method {baseline}")
     scores = {name: _from_json(entry["pairs"]) for name, entry in entries.items()}
     for name, entry in entries.items():
         other = None if name == baseline else scores[baseline]

@@ -1,5 +1,6 @@
 """Homography evaluation on a small made-up folder: one texture warped by known homographies."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -99,6 +100,11 @@ def test_second_run_measures_only_what_is_new(folder: Path, tmp_path: Path):
     )
     assert seen == ["i_plane", "v_plane"]
     assert set(load_results(results)["methods"]) == {"nn", "oracle"}
+    values = load_results(results)
+    values["methods"]["nn"]["summary"]["auc"] = {"3": "x"}
+    (tmp_path / "damaged.json").write_text(json.dumps(values, indent=1))
+    with pytest.raises(InputError, match=r"damaged\.json: "):
+        evaluate_homography(folder, ["nn"], results=tmp_path / "damaged.json")
     changed = tmp_path / "changed" / folder.name
     shutil.copytree(folder, changed)
     _write(changed / "v_plane" / "2.ppm", np.full((240, 320), 128, np.uint8))

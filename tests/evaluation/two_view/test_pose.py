@@ -173,7 +173,7 @@ def test_files_that_are_no_results_are_not_overwritten(pairs_file: Path, tmp_pat
 
 
 def test_baseline_has_to_be_measured(pairs_file: Path):
-    with pytest.raises(ConfigError, match="baseline 'nn/ransac' was not measured"):
+    with pytest.raises(ConfigError, match="baseline 'nn/ransac' is none of the methods to measure"):
         evaluate_pose(pairs_file, ["mutual/poselib"], baseline="nn/ransac")
 
 
