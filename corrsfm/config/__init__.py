@@ -7,6 +7,7 @@ from corrsfm.config.fields import (
     encoded,
     from_dict,
     hash_encoded,
+    hash_of_content,
     option,
     to_dict,
 )
@@ -69,6 +70,7 @@ __all__ = [
     "encoded",
     "from_dict",
     "hash_encoded",
+    "hash_of_content",
     "load_pipeline",
     "option",
     "to_dict",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from corrsfm.errors import ConfigError, InputError
-from corrsfm.files import read_text, why_unusable
+from corrsfm.files import read_text, sha256_of, why_unusable
 
 __all__ = [
     "LARGEST_INT",
@@ -27,6 +27,7 @@ __all__ = [
     "flags_of",
     "from_dict",
     "hash_encoded",
+    "hash_of_content",
     "load_toml",
     "option",
     "to_dict",
@@ -243,6 +244,15 @@ def config_hash(*parts: Any) -> str:
     Options that do not affect results are left out.
     """
     return hash_encoded(*map(encoded, parts))
+
+
+def hash_of_content(path: Path) -> str:
+    """Hex digest of what a file, or all files of a folder, hold; what reads them reports missing ones."""
+    if os.path.isdir(path):
+        return config_hash(
+            *[[file.name, sha256_of(file)] for file in sorted(path.iterdir()) if file.is_file()]
+        )
+    return config_hash(sha256_of(path) if os.path.isfile(path) else "")
 
 
 def encoded(part: Any) -> str:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-import os
 import time
-from pathlib import Path
 
 from corrsfm import config as cfg
-from corrsfm.config import config_hash
+from corrsfm.config import config_hash, hash_of_content
 from corrsfm.errors import InputError
-from corrsfm.files import sha256_of
 from corrsfm.graph import describe_components
 from corrsfm.pairs import strategies
 from corrsfm.types import PairList
@@ -95,7 +92,7 @@ def fingerprint_of(
     index: Index, features: str, config: cfg.PairsConfig, seed: int, *, is_sequence: bool
 ) -> str:
     """What the record of the stage must carry to be current; ``features`` is the fingerprint of theirs."""
-    files = [_content(path) for path in (config.pairs_file, config.covisible_model) if path is not None]
+    files = [hash_of_content(path) for path in (config.pairs_file, config.covisible_model) if path]
     order = ["in the order of time"] if is_sequence else []
     photos = [[r.name, r.gps] for r in index.records]
     # What is in a file decides about equal pairs, not where it is.
@@ -116,12 +113,3 @@ def _warn_if_disconnected(names: list[str], pair_list: PairList) -> None:
     text = describe_components(names, pair_list.pairs)
     if text:
         logger.warning("%s", text)
-
-
-def _content(path: Path) -> str:
-    """Hash of what a file or all files of a folder hold; what reads them reports missing ones."""
-    if os.path.isdir(path):
-        return config_hash(
-            *[[file.name, sha256_of(file)] for file in sorted(path.iterdir()) if file.is_file()]
-        )
-    return config_hash(sha256_of(path) if os.path.isfile(path) else "")

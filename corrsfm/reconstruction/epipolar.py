@@ -8,6 +8,7 @@ is NaN and fails every threshold.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,9 +89,8 @@ class TwoViews:
         (K,) bool
             The signs of both depths where the rays come closest; False for parallel rays.
         """
-        rotation, translation = self._cam1_from_cam0()
-        x0, x1 = self._homogeneous(matches)
-        ray0 = x0 @ rotation.T
+        translation = self._cam1_from_cam0[1]
+        ray0, x1 = self._rays_in_cam1(matches)
         # Least squares of depth1 · x1 = depth0 · R x0 + t; both depths times the same positive determinant.
         ray00, ray11 = np.sum(ray0**2, axis=1), np.sum(x1**2, axis=1)
         ray01 = np.einsum("ki,ki->k", ray0, x1)
@@ -112,8 +112,7 @@ class TwoViews:
         (K,) float64
             Pixels of photo 1; NaN where the ray of photo 0 leads behind photo 1.
         """
-        x0, x1 = self._homogeneous(matches)
-        ray0 = x0 @ self._cam1_from_cam0()[0].T
+        ray0, x1 = self._rays_in_cam1(matches)
         depth = np.where(ray0[:, 2] > 0, ray0[:, 2], np.nan)
         return self.rays1.focal_px * np.linalg.norm(ray0[:, :2] / depth[:, None] - x1[:, :2], axis=1)
 
@@ -129,18 +128,23 @@ class TwoViews:
         -------
         (K,) float64
         """
-        x0, x1 = self._homogeneous(matches)
-        ray0 = x0 @ self._cam1_from_cam0()[0].T
+        ray0, x1 = self._rays_in_cam1(matches)
         sine = np.linalg.norm(np.cross(ray0, x1), axis=1)
         return np.degrees(np.arctan2(sine, np.einsum("ki,ki->k", ray0, x1)))
 
+    @cached_property
     def _cam1_from_cam0(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return relative_pose(
             self.view0.rotation, self.view0.translation, self.view1.rotation, self.view1.translation
         )
 
+    def _rays_in_cam1(self, matches: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Directions (K, 3) of both keypoints of matches, turned into the frame of photo 1."""
+        x0, x1 = self._homogeneous(matches)
+        return x0 @ self._cam1_from_cam0[0].T, x1
+
     def _essential(self) -> NDArray[np.float64]:
-        return essential_from_pose(*self._cam1_from_cam0())
+        return essential_from_pose(*self._cam1_from_cam0)
 
     def _homogeneous(self, matches: NDArray[np.integer]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return (

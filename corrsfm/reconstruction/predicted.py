@@ -188,9 +188,9 @@ def predict_pair(neighbours: Neighbours, two: TwoViews) -> NDArray[np.int32]:
     """Predicted matches of a pair.
 
     Of a keypoint's neighbours those count that lie on its epipolar line and in front of both photos, or so
-    far away that noise decides the side. The
-    nearest is accepted if it is clearly nearer than the next that counts, or than the last neighbour where
-    no other counts. Of several that accept the same keypoint of photo 1 the nearest stays.
+    far away that noise decides the side. The nearest is accepted if it is clearly nearer than the next that
+    counts, or than the last neighbour where no other counts. Of several that accept the same keypoint of
+    photo 1 the nearest stays.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.config import FeaturesConfig, config_hash, to_dict
+from corrsfm.config import FeaturesConfig, config_hash, hash_of_content, to_dict
 from corrsfm.errors import InputError
 from corrsfm.evaluation.metrics import homography_corner_error, pose_auc
 from corrsfm.evaluation.records import (
@@ -27,7 +27,7 @@ from corrsfm.evaluation.records import (
     save_results,
 )
 from corrsfm.evaluation.two_view.filters import PairFilter, parse_filter
-from corrsfm.files import read_text, sha256_of
+from corrsfm.files import read_text
 from corrsfm.labelled.oanet import OANetPair
 from corrsfm.types import Camera, Features, PruneResult
 
@@ -262,7 +262,7 @@ def evaluate_homography(
     subject = {
         "name": folder.name,
         "sequences": [sequence.name for sequence in sequences],
-        "sha256": _content(sequences),
+        "sha256": config_hash([[sequence.name, hash_of_content(sequence)] for sequence in sequences]),
         "features": to_dict(features),
     }
 
@@ -294,12 +294,6 @@ def evaluate_homography(
     if results is not None:
         save_results(results, "homography", values)
     return values
-
-
-def _content(sequences: Sequence[Path]) -> str:
-    """Hash of all photos and homographies."""
-    files = [path for sequence in sequences for path in sorted(sequence.iterdir()) if path.is_file()]
-    return config_hash([[path.parent.name, path.name, sha256_of(path)] for path in files])
 
 
 def _measure(
