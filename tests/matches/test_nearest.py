@@ -6,6 +6,7 @@ import torch
 from numpy.typing import NDArray
 
 from corrsfm.descriptors import as_integers
+from corrsfm.matches import nearest
 from corrsfm.matches.nearest import Matcher, match_features
 
 
@@ -35,6 +36,16 @@ def plain_matches(
     return nearest, ratios, mutual
 
 
+@pytest.fixture(params=["bytes", "floats"])
+def products(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both ways to multiply, whichever this processor takes."""
+    exact = nearest._multiplies_bytes()
+    if request.param == "bytes" and not exact:
+        pytest.skip("this processor does not multiply bytes exactly")
+    monkeypatch.setattr(nearest, "_multiplies_bytes", lambda: request.param == "bytes")
+
+
+@pytest.mark.usefixtures("products")
 @pytest.mark.parametrize("num0, num1", [(1, 1), (1, 2), (7, 1), (3, 300), (300, 3), (257, 130)])
 @pytest.mark.parametrize("high", [2, 256])
 @pytest.mark.parametrize("block_size", [32, 100, 4096])
@@ -49,6 +60,7 @@ def test_matches_equal_a_plain_search(num0: int, num1: int, high: int, block_siz
     np.testing.assert_array_equal(matches.mutual, mutual)
 
 
+@pytest.mark.usefixtures("products")
 def test_distances_are_exact_at_the_largest_descriptors() -> None:
     zero = np.zeros((1, 128), np.uint8)
     far = np.full((2, 128), 255, np.uint8)
@@ -59,6 +71,7 @@ def test_distances_are_exact_at_the_largest_descriptors() -> None:
     assert matches.ratios[0] == np.float32(expected) < 1
 
 
+@pytest.mark.usefixtures("products")
 def test_long_descriptors_are_matched_exactly_too() -> None:
     far = np.full((2, 512), 255, np.uint8)
     far[1, 0] = 254
@@ -74,6 +87,7 @@ def test_a_single_candidate_has_ratio_one() -> None:
     assert match_features(descriptors(4, 0), descriptors(1, 1)).ratios.tolist() == [1.0] * 4
 
 
+@pytest.mark.usefixtures("products")
 def test_equal_distances_take_the_lowest_index_and_ratio_one() -> None:
     same = np.repeat(descriptors(1, 0), 5, axis=0)
     matches = match_features(same, same, block_size=2)
@@ -82,6 +96,28 @@ def test_equal_distances_take_the_lowest_index_and_ratio_one() -> None:
     assert matches.mutual.tolist() == [True] + [False] * 4
 
 
+@pytest.mark.parametrize("num", [1, 5, 300])
+def test_bytes_and_floats_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
+    if not nearest._multiplies_bytes():
+        pytest.skip("this processor does not multiply bytes exactly")
+    pair = descriptors(700, 0), descriptors(num, 1)
+    by_bytes = match_features(*pair)
+    monkeypatch.setattr(nearest, "_multiplies_bytes", bool)
+    by_floats = match_features(*pair)
+    for name in ("indices", "ratios", "mutual"):
+        assert getattr(by_bytes, name).tobytes() == getattr(by_floats, name).tobytes()
+
+
+def test_a_product_that_saturates_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    def saturates(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        return (left.int() @ right.int()).clamp(-(2**15), 2**15 - 1)
+
+    monkeypatch.setattr(torch, "_int_mm", saturates)
+    monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: True)
+    assert not nearest._multiplies_bytes.__wrapped__()
+
+
+@pytest.mark.usefixtures("products")
 def test_mutual_matches_use_each_keypoint_once() -> None:
     matches = match_features(descriptors(200, 0, high=3, size=6), descriptors(200, 1, high=3, size=6))
     used = matches.indices[matches.mutual, 1]
