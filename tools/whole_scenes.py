@@ -75,7 +75,7 @@ SETTINGS: list[Plain | Corrsfm] = [
     ),
     *(
         Corrsfm(name=f"corrsfm {method}", column=f"corrsfm {method}", prune=("--method", method))
-        for method in ("ratio", "loransac", "corradaptor")
+        for method in ("ratio", "loransac", "corradaptor", "oanet")
     ),
     Corrsfm(
         name="corrsfm corradaptor, first model",

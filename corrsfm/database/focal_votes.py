@@ -11,6 +11,7 @@ lie in several places or flee to infinity.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from corrsfm.database.focal_evidence import (
     weigh_pair,
 )
 from corrsfm.database.focal_groups import split_in_two
+from corrsfm.machine import threaded
 
 __all__ = ["FocalGroup", "FocalVotes", "VoteDecision", "count_votes", "pairs_that_vote"]
 
@@ -117,7 +119,12 @@ class FocalVotes:
 
 
 def count_votes(
-    pairs: Sequence[PairPoints], longest_side_px: float, *, seed: int = 0, may_split: bool = True
+    pairs: Sequence[PairPoints],
+    longest_side_px: float,
+    *,
+    seed: int = 0,
+    may_split: bool = True,
+    num_threads: int = 1,
 ) -> FocalVotes:
     """Let the pairs of a proposed camera vote.
 
@@ -131,10 +138,12 @@ def count_votes(
         Of the random samples. Equal seeds and pairs give equal votes, in whatever order the pairs come.
     may_split : bool
         Whether to look for two groups; if not, what would be two groups is ``scattered``.
+    num_threads : int
+        Pairs weighed at a time; the votes are the same.
     """
     chosen = pairs_that_vote(pairs)
-    weighed = [weigh_pair(pair, longest_side_px, seed=seed) for pair in chosen]
-    evidence = [one for one in weighed if one is not None]
+    weigh = functools.partial(weigh_pair, longest_side_px=longest_side_px, seed=seed)
+    evidence = [vote for _, vote in threaded(weigh, chosen, num_threads) if vote is not None]
     if not evidence:
         return FocalVotes(decision=VoteDecision.UNDECIDED)
     votes = _shared(evidence, longest_side_px)

@@ -71,7 +71,7 @@ def verify_matches(
         pruned_of(workspace).reader() as read_pruned,
     ):
         records, cameras, remarks = _decide_cameras(
-            workspace, index, voting, read_features, read_pruned, pair_list.pairs, run.seed
+            workspace, index, voting, read_features, read_pruned, pair_list.pairs, run
         )
         for remark in remarks:
             logger.info("%s", remark)
@@ -162,7 +162,7 @@ def _decide_cameras(
     read_features: Callable[[str], Features],
     read_kept: Callable[[Pair], PrunedMatches],
     pairs: Sequence[Pair],
-    seed: int,
+    run: cfg.RunConfig,
 ) -> tuple[list[ImageRecord], list[Camera], list[str]]:
     """Assign cameras by the votes of the kept matches, with a remark on each decision."""
     # Sharing that the user asked for is not undone.
@@ -176,7 +176,13 @@ def _decide_cameras(
             _centred_points(camera_of, pair, read_features, read_kept(pair).indices)
             for pair in _strongest(workspace, [pair for pair in pairs if names.issuperset(pair)])
         ]
-        counted = count_votes(points, max(camera.width, camera.height), seed=seed, may_split=not asked_for)
+        counted = count_votes(
+            points,
+            max(camera.width, camera.height),
+            seed=run.seed,
+            may_split=not asked_for,
+            num_threads=count_threads(run.threads),
+        )
         if asked_for and counted.decision is VoteDecision.SCATTERED:
             counted = dataclasses.replace(counted, decision=VoteDecision.UNDECIDED)
         votes[ids] = counted

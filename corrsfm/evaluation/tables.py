@@ -213,32 +213,44 @@ def _scene_table(values: dict[str, Any]) -> Table:
     )
 
 
+_PYCOLMAP_STAGES = {
+    "extract": ("features",),
+    "match": ("matches",),
+    "prune": ("pruned matches",),
+    "verify": ("verified matches",),
+    "map": ("models",),
+}
+
+
 def _pycolmap_table(values: dict[str, Any]) -> Table:
-    header = [
-        "scene",
-        "photos",
-        "method",
-        "registered",
-        "points",
-        "median error px",
-        "seconds",
-        "CPU seconds",
-    ]
-    rows = [
-        [
-            row["scene"],
-            str(row["photos"]),
-            row["method"],
-            str(row["registered"]),
-            str(row["points"]),
-            _number(row["median_error_px"], 2),
-            _number(row["seconds"]),
-            _number(row["processor_seconds"]),
+    """Rows of the runs on one core, beside the seconds of those on all; and their sums by method."""
+    rows, single = [], [row for row in values["rows"] if row["cores"] == 1]
+    most = max(row["cores"] for row in values["rows"])
+    parallel = {(row["scene"], row["method"]): row for row in values["rows"] if row["cores"] == most}
+    totals: dict[str, list[float]] = {}
+    for row in single:
+        beside = parallel[row["scene"], row["method"]]
+        stages = [
+            sum(row["stage_seconds"].get(stage, 0.0) for stage in names)
+            for names in _PYCOLMAP_STAGES.values()
         ]
-        for row in values["rows"]
+        numbers = [*stages, row["seconds"], row["processor_seconds"], beside["seconds"]]
+        sums = totals.setdefault(row["method"], [0.0] * len(numbers))
+        totals[row["method"]] = [total + number for total, number in zip(sums, numbers, strict=True)]
+        facts = [row["scene"], str(row["photos"]), row["method"], str(row["registered"]), str(row["points"])]
+        error = _number(row["median_error_px"], 2)
+        rows.append([*facts, error, *(_number(number) if number else "–" for number in numbers)])
+    for method, numbers in totals.items():
+        blank = ["", "", ""]
+        rows.append(["all", "", method, *blank, *(_number(number) if number else "–" for number in numbers)])
+    header = [
+        *("scene", "photos", "method", "registered", "points", "median error px"),
+        *(f"{stage} s" for stage in _PYCOLMAP_STAGES),
+        *("one core s", "CPU s", f"{most} cores s"),
     ]
     caption = (
-        f"Up to {values['subject']['max_features']} features a photo, exhaustive pairs. {_origin(values)}"
+        f"Up to {values['subject']['max_features']} features a photo, exhaustive pairs. Stages on one core; "
+        f"pycolmap verifies as it matches. {_origin(values)}"
     )
     return Table(header=header, rows=rows, caption=caption)
 

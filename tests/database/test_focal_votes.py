@@ -90,6 +90,7 @@ def test_the_same_pairs_in_another_order_give_the_same_votes(
     one_camera: list[PairPoints], votes_of_one: FocalVotes
 ) -> None:
     assert count_votes(one_camera[::-1], SIDE_PX) == votes_of_one
+    assert count_votes(one_camera, SIDE_PX, num_threads=3) == votes_of_one
 
 
 def test_without_pairs_nothing_is_decided() -> None:

@@ -53,7 +53,7 @@ def index_as(workspace: Workspace, mode: cfg.CameraMode) -> list[tuple[int, ...]
 
 
 def decide(workspace: Workspace, voting: list[tuple[int, ...]]) -> tuple:
-    return stage._decide_cameras(workspace, INDEX, voting, features, kept, PAIRS, seed=0)
+    return stage._decide_cameras(workspace, INDEX, voting, features, kept, PAIRS, cfg.RunConfig(seed=0, threads=1))
 
 
 def test_photos_with_a_camera_each_by_request_do_not_vote(workspace: Workspace) -> None:
@@ -88,7 +88,7 @@ def test_points_reach_the_votes_relative_to_the_principal_point(
     assert (first.name0, first.name1, second.name1, longest_side_px) == ("0.jpg", "1.jpg", "2.jpg", 640)
     np.testing.assert_array_equal(first.points0_px, features("0.jpg").keypoints[:4] - [320.0, 240.0])
     np.testing.assert_array_equal(second.points1_px, features("2.jpg").keypoints[4:8] - [320.0, 240.0])
-    assert options == {"seed": 0, "may_split": True}
+    assert options == {"seed": 0, "may_split": True, "num_threads": 1}
 
 
 @pytest.mark.parametrize(("mode", "num_cameras"), [(cfg.CameraMode.AUTO, 3), (cfg.CameraMode.SINGLE, 1)])

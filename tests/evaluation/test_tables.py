@@ -49,8 +49,10 @@ def test_pose_command_prints_json_and_records_itself(results_dir: Path, tmp_path
 def test_other_results_of_the_project_have_a_table(repository: Path, name: str):
     values = load_results(repository / "results" / f"{name}.json")
     table = render_table(values)
-    assert len(values["rows"]) >= 4
-    assert table.count("\n| ") >= len(values["rows"])
+    # Those of all cores stand beside those of one.
+    shown = [row for row in values["rows"] if name != "against_pycolmap" or row["cores"] == 1]
+    assert len(shown) >= 4
+    assert table.count("\n| ") >= len(shown)
 
 
 def scene_row(

@@ -1,0 +1,70 @@
+#!/usr/bin/env bash
+# Train the small OANet once as a base and once for each change of its recipe, from nothing, in 15 minutes of one
+# processor core each, and measure them side by side on validation pairs.
+#
+#   tools/ablations.sh train   NAME → runs/ablation/NAME/latest.pt
+#   tools/ablations.sh val     → results/ablation_4096.json and results/ablation_2000.json, by keypoints a photo
+#
+# pairs/ holds train_negatives.h5 (4,096 keypoints a photo), val.h5 (2,000) and val_4096.h5, which
+# `corrsfm train prepare` makes, see pipelines/train_oanet_more.toml. A run that was stopped goes on where it was.
+set -euo pipefail
+
+names=(base negatives threshold thinning wide)
+
+recipe() { # the recipe of a name
+  local negative_share=0.0 threshold=1e-4 thin_probability=0.3 channels=32 clusters=48
+  case $1 in
+  negatives) negative_share=0.15 ;; # pairs of two places
+  threshold) threshold=3e-5 ;;      # stricter labels
+  thinning) thin_probability=0.6 ;; # of the pairs lose right matches
+  wide) channels=64 clusters=64 ;;
+  esac
+  cat <<TOML
+[train]
+train_files = ["pairs/train_negatives.h5"]
+val_file = "pairs/val.h5"
+output = "runs/ablation/$1"
+input = "mutual"
+negative_share = $negative_share
+batch_size = 8
+num_matches = 512
+max_minutes = 15
+processor_time = true
+learning_rate = 1e-3
+threshold = $threshold
+
+[augment]
+thin_probability = $thin_probability
+
+[network]
+architecture = "oanet"
+channels = $channels
+clusters = $clusters
+side_channels = 5
+TOML
+}
+
+case ${1:-} in
+train)
+  mkdir -p runs/ablation
+  for name in "${names[@]}"; do
+    recipe "$name" > "runs/ablation/$name.toml"
+    corrsfm train run --config "runs/ablation/$name.toml" --threads 1 --resume
+  done
+  ;;
+val)
+  methods=(--method ratio0.8+mutual/poselib)
+  for name in "${names[@]}"; do methods+=(--method "oanet@pose:runs/ablation/$name/latest.pt/poselib"); done
+  methods+=(--method oanet@pose/poselib --method corradaptor@pose/poselib)
+  for keypoints in 4096 2000; do
+    pairs=pairs/val.h5
+    [ "$keypoints" = 2000 ] || pairs=pairs/val_4096.h5
+    corrsfm evaluate pose "$pairs" --max-per-scene 40 --threads 1 "${methods[@]}" \
+      --baseline oanet@pose:runs/ablation/base/latest.pt/poselib --results "results/ablation_$keypoints.json"
+  done
+  ;;
+*)
+  sed -n '2,10p' "$0" | sed 's/^# \{0,1\}//' >&2
+  exit 2
+  ;;
+esac
