@@ -180,15 +180,11 @@ def _search_on_cpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Ne
             loser = np.maximum(best[rows], block_best)
             second[rows] = np.minimum(np.minimum(second[rows], distances.min(axis=1)), loser)
             best[rows] = np.minimum(best[rows], block_best)
-    floats = [
-        np.where(values == none, np.inf, values).astype(np.float64) for values in (best, second, best_back)
-    ]
-    return (
-        torch.from_numpy(floats[0]),
-        torch.from_numpy(floats[1]),
-        torch.from_numpy(index),
-        torch.from_numpy(floats[2]),
+    first, runner_up, back = (
+        torch.from_numpy(np.where(values == none, np.inf, values)).double()
+        for values in (best, second, best_back)
     )
+    return first, runner_up, torch.from_numpy(index), back
 
 
 def _distances_on_cpu(image0: _Prepared, image1: _Prepared, rows: slice, columns: slice) -> NDArray:

@@ -53,7 +53,9 @@ def index_as(workspace: Workspace, mode: cfg.CameraMode) -> list[tuple[int, ...]
 
 
 def decide(workspace: Workspace, voting: list[tuple[int, ...]]) -> tuple:
-    return stage._decide_cameras(workspace, INDEX, voting, features, kept, PAIRS, cfg.RunConfig(seed=0, threads=1))
+    return stage._decide_cameras(
+        workspace, INDEX, voting, features, kept, PAIRS, cfg.RunConfig(seed=0, threads=1)
+    )
 
 
 def test_photos_with_a_camera_each_by_request_do_not_vote(workspace: Workspace) -> None:
