@@ -19,7 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import InputError, lack_or_text
-from corrsfm.evaluation.metrics import POSE_THRESHOLDS_DEG, Interval, auc_contributions, bootstrap_mean
+from corrsfm.evaluation.metrics import (
+    POSE_THRESHOLDS_DEG,
+    Interval,
+    auc_contributions,
+    bootstrap_mean,
+    pose_auc,
+)
 from corrsfm.files import atomic_write_text, read_text
 from corrsfm.machine import count_threads, versions
 
@@ -68,11 +74,18 @@ def rounded_interval(interval: Interval) -> list[float]:
 def auc_intervals(
     errors: NDArray[np.float64], thresholds: Sequence[float], seed: int
 ) -> dict[str, list[float]]:
-    """Bootstrap intervals of the AUC of errors (n,) by threshold."""
-    return {
-        f"{t:g}": rounded_interval(bootstrap_mean(auc_contributions(errors, t), seed=seed))
-        for t in thresholds
-    }
+    """Bootstrap intervals of the AUC of errors (n,) by threshold, around the very `pose_auc`.
+
+    What is resampled is the area below the steps; it is moved by what the trapezoid rule adds to that.
+    """
+    intervals = {}
+    for threshold, area in zip(thresholds, pose_auc(errors, thresholds), strict=True):
+        steps = bootstrap_mean(auc_contributions(errors, threshold), seed=seed)
+        added = area - steps.mean
+        intervals[f"{threshold:g}"] = rounded_interval(
+            Interval(mean=area, low=steps.low + added, high=steps.high + added)
+        )
+    return intervals
 
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:

@@ -15,6 +15,7 @@ from corrsfm.evaluation.metrics import (
     precision_recall_f,
     relative_pose_errors,
 )
+from corrsfm.evaluation.records import auc_intervals
 
 
 def _rotation_about_y(degrees: float) -> np.ndarray:
@@ -32,6 +33,16 @@ def test_auc_of_hand_made_errors_is_exact():
 def test_auc_of_perfect_and_of_failed_pairs():
     assert pose_auc([0.0, 0.0], [5.0, 20.0]) == [100.0, 100.0]
     assert pose_auc([np.inf, 180.0], [5.0, 20.0]) == [0.0, 0.0]
+
+
+def test_the_interval_of_an_auc_surrounds_that_auc():
+    errors = np.array([0.5, 4.0, 12.0])
+    (area,) = pose_auc(errors, [5.0])
+    mean, low, high = auc_intervals(errors, [5.0], 0)["5"]
+    assert mean == pytest.approx(area, abs=1e-3)
+    assert low < area < high
+    # One pair has no spread.
+    assert auc_intervals(errors[:1], [5.0], 0)["5"] == [pytest.approx(pose_auc(errors[:1], [5.0])[0])] * 3
 
 
 @pytest.mark.parametrize("threshold", [5.0, 10.0, 20.0])
