@@ -40,10 +40,9 @@ from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import normalise_by_pinhole
 from corrsfm.errors import InputError
-from corrsfm.files import atomic_path
 from corrsfm.geometry import essential_from_pose, relative_pose, symmetric_epipolar_distance_sq, wrap_angles
 from corrsfm.hdf5 import lies_elsewhere
-from corrsfm.labelled.oanet import OANetPair, open_pairs, select_per_scene
+from corrsfm.labelled.oanet import OANetPair, new_pairs_file, open_pairs, select_per_scene
 from corrsfm.types import Camera
 
 __all__ = [
@@ -216,7 +215,7 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
         The number of pairs written.
     """
     num_pairs = 0
-    with atomic_path(Path(path)) as temporary, h5py.File(temporary, "w") as file:
+    with new_pairs_file(Path(path)) as (file, check):
         file.attrs["format"], file.attrs["version"] = _FORMAT, _VERSION
         for scene in scenes:
             group = file.create_group(scene.name)
@@ -226,6 +225,7 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
             for name, values in _encode(scene).items():
                 compress = {"compression": "gzip", "shuffle": True} if values.size > 64 else {}
                 group.create_dataset(name, data=values, **compress)
+            check()
             num_pairs += len(scene.pairs)
     return num_pairs
 

@@ -15,8 +15,8 @@ and this one does not need: ``log_scale_ratios``, ``rotations`` (N,), ``sizes`` 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,14 +26,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.colmap.cameras import pinhole_parameters
-from corrsfm.errors import InputError
+from corrsfm.disk import why_not
+from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_path, require_file
 from corrsfm.geometry import INLIER_THRESHOLD
-from corrsfm.hdf5 import lies_elsewhere, open_hdf5
+from corrsfm.hdf5 import create_hdf5, lies_elsewhere, open_hdf5
 from corrsfm.types import Camera, Correspondences
 
 __all__ = [
     "OANetPair",
+    "new_pairs_file",
     "open_pairs",
     "read_pairs",
     "select_per_scene",
@@ -280,6 +282,23 @@ def select_per_scene(scenes: list[str], max_per_scene: int, seed: int) -> list[i
     return sorted(chosen)
 
 
+@contextmanager
+def new_pairs_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
+    """A file of labelled pairs to write, replaced when all is written; see `corrsfm.hdf5.create_hdf5`.
+
+    Raises
+    ------
+    WorkspaceError
+        If there can be no such file.
+    """
+    with atomic_path(path) as temporary, ExitStack() as stack:
+        try:
+            opened = stack.enter_context(create_hdf5(temporary))
+        except OSError as error:
+            raise WorkspaceError(why_not(error, path, "written")) from error
+        yield opened
+
+
 def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
     """Write labelled pairs in OANet's layout, which has no place for a camera's distortion.
 
@@ -295,11 +314,12 @@ def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
         Number of pairs written.
     """
     count = 0
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as handle:
+    with new_pairs_file(path) as (handle, check):
         for name in (*_REQUIRED, "log_scale_ratios", "rotations", "sizes", "scenes"):
             handle.create_group(name)
         for count, pair in enumerate(pairs, start=1):
             _write_pair(handle, str(count - 1), pair)
+            check()
     return count
 
 

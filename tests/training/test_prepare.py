@@ -2,17 +2,19 @@
 
 import dataclasses
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from labelled_scene import make_scene
 
 from corrsfm.config import FeatureKind, MatchInput
-from corrsfm.errors import ConfigError, InputError
+from corrsfm.errors import ConfigError, InputError, WorkspaceError
 from corrsfm.features import create_extractor
-from corrsfm.labelled.compact import read_labelled_pairs, read_scenes
-from corrsfm.labelled.oanet import read_pairs
+from corrsfm.labelled.compact import read_labelled_pairs, read_scenes, write_scenes
+from corrsfm.labelled.oanet import read_pairs, write_pairs
 from corrsfm.model import CorrAdaptor, NetworkConfig, load_network
 from corrsfm.training import prepare
 from corrsfm.training.config import (
@@ -169,6 +171,30 @@ def test_photos_that_share_nothing_are_negatives(repository, tmp_path):
     assert len(list(read_labelled_pairs(tmp_path / "pairs.h5"))) == 1
     with pytest.raises(ConfigError, match="--layout compact"):
         prepare_oanet(tmp_path / "oanet.h5", [shared], config)
+
+
+@pytest.mark.parametrize("layout", ["compact", "oanet"])
+def test_a_disk_that_takes_no_more_is_named_and_nothing_is_left(tmp_path, layout):
+    scene = make_scene("a", num_keypoints=400)
+    path = tmp_path / "pairs.h5"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, before[1]))
+    try:
+        # Not what HDF5 says when it misses what it wrote.
+        with pytest.raises(OSError, match="File too large") as caught:
+            if layout == "compact":
+                write_scenes(path, [scene])
+            else:
+                write_pairs(path, map(scene.pair, range(len(scene.pairs))))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_for_no_file_is_refused():
+    with pytest.raises(WorkspaceError, match=r"/proc/pairs.h5: cannot be written"):
+        write_scenes(Path("/proc/pairs.h5"), [])
 
 
 def test_a_folder_without_a_model_is_refused(tmp_path):
