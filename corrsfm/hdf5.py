@@ -1,16 +1,14 @@
-"""HDF5 files: new ones, and those of others if everything in them is their own and can be named."""
+"""HDF5 files of others: opened only if everything in them is their own and can be named."""
 
 from __future__ import annotations
 
 import contextlib
-import io
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 
-__all__ = ["create_hdf5", "lies_elsewhere", "open_hdf5"]
+__all__ = ["lies_elsewhere", "open_hdf5"]
 
 
 @contextlib.contextmanager
@@ -45,46 +43,3 @@ def _strange_link(name: bytes, info: h5py.h5l.LinkInfo) -> str | None:
 def lies_elsewhere(dataset: h5py.Dataset) -> bool:
     """Whether the values of a dataset would be read from another file, which may be any of this machine."""
     return bool(dataset.is_virtual or dataset.external)
-
-
-class _CarefulFile(io.FileIO):
-    """Keeps an error of the disk instead of raising it: met as it closes, HDF5 ends the process."""
-
-    error: OSError | None = None
-
-    def flush(self) -> None:
-        """Nothing is held back; HDF5 looks for this on the class itself."""
-
-    def write(self, content: Any, /) -> int:
-        """Write all of it, unless something was lost before."""
-        left = memoryview(content).cast("B")
-        size = left.nbytes
-        try:
-            while left and self.error is None:
-                left = left[super().write(left) :]
-        except OSError as error:
-            self.error = OSError(error.errno, error.strerror, str(self.name))
-        return size
-
-    def check(self) -> None:
-        """Raise the first error of writing, if there was one."""
-        if self.error is not None:
-            raise self.error
-
-
-@contextlib.contextmanager
-def create_hdf5(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
-    """Open a new file for writing, with a function that raises what the disk has objected to so far.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be made, or at the end if something could not be written.
-    """
-    with _CarefulFile(path, "w+") as raw:
-        try:
-            with h5py.File(raw, "w") as file:
-                yield file, raw.check
-        finally:
-            # Also where HDF5 stumbled over what is missing: this is why.
-            raw.check()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -13,7 +16,6 @@ from numpy.typing import NDArray
 from corrsfm.colmap.databases import copy_photos_of
 from corrsfm.colmap.models import write_model
 from corrsfm.files import atomic_write_text
-from corrsfm.hdf5 import create_hdf5
 from corrsfm.types import Features, check_indices
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.hloc import HALF_PIXEL, check_hloc_keys, pair_group
@@ -71,16 +73,43 @@ def write_hloc(model: pycolmap.Reconstruction, workspace: Workspace, folder: Pat
     copy_photos_of(workspace.database, folder / "sfm" / "database.db", names)
 
 
+class _CarefulFile(io.FileIO):
+    """Keeps an error of the disk instead of raising it: met as it closes, HDF5 ends the process."""
+
+    error: OSError | None = None
+
+    def flush(self) -> None:
+        """Nothing is held back; HDF5 looks for this on the class itself."""
+
+    def write(self, content: Any, /) -> int:
+        """Write all of it, unless something was lost before."""
+        left = memoryview(content).cast("B")
+        size = left.nbytes
+        try:
+            while left and self.error is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.error = error
+        return size
+
+    def check(self) -> None:
+        """Raise the first error of writing, if there was one."""
+        if self.error is not None:
+            raise self.error
+
+
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[Callable[[str, NDArray], None]]:
     """A function that puts an array under a name into a new HDF5 file."""
-    with create_hdf5(path) as (file, check):
+    with _CarefulFile(path, "w+") as raw:
+        with h5py.File(raw, "w") as file:
 
-        def put(name: str, values: NDArray) -> None:
-            file[name] = values
-            check()
+            def put(name: str, values: NDArray) -> None:
+                file[name] = values
+                raw.check()
 
-        yield put
+            yield put
+        raw.check()
 
 
 def _arrays(features: Features) -> dict[str, NDArray]:

@@ -215,7 +215,7 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
         The number of pairs written.
     """
     num_pairs = 0
-    with new_pairs_file(Path(path)) as (file, check):
+    with new_pairs_file(Path(path)) as file:
         file.attrs["format"], file.attrs["version"] = _FORMAT, _VERSION
         for scene in scenes:
             group = file.create_group(scene.name)
@@ -225,7 +225,6 @@ def write_scenes(path: Path, scenes: Iterable[CompactScene]) -> int:
             for name, values in _encode(scene).items():
                 compress = {"compression": "gzip", "shuffle": True} if values.size > 64 else {}
                 group.create_dataset(name, data=values, **compress)
-            check()
             num_pairs += len(scene.pairs)
     return num_pairs
 

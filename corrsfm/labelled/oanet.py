@@ -15,8 +15,8 @@ and this one does not need: ``log_scale_ratios``, ``rotations`` (N,), ``sizes`` 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -30,7 +30,7 @@ from corrsfm.disk import why_not
 from corrsfm.errors import InputError, WorkspaceError
 from corrsfm.files import atomic_path, require_file
 from corrsfm.geometry import INLIER_THRESHOLD
-from corrsfm.hdf5 import create_hdf5, lies_elsewhere, open_hdf5
+from corrsfm.hdf5 import lies_elsewhere, open_hdf5
 from corrsfm.types import Camera, Correspondences
 
 __all__ = [
@@ -283,20 +283,25 @@ def select_per_scene(scenes: list[str], max_per_scene: int, seed: int) -> list[i
 
 
 @contextmanager
-def new_pairs_file(path: Path) -> Iterator[tuple[h5py.File, Callable[[], None]]]:
-    """A file of labelled pairs to write, replaced when all is written; see `corrsfm.hdf5.create_hdf5`.
+def new_pairs_file(path: Path) -> Iterator[h5py.File]:
+    """A file of labelled pairs to fill in; it is kept in memory, and replaced once it is whole.
+
+    HDF5 itself ends the process, or says something else, where a disk takes no more.
 
     Raises
     ------
     WorkspaceError
-        If there can be no such file.
+        If the file cannot be written.
     """
-    with atomic_path(path) as temporary, ExitStack() as stack:
+    with atomic_path(path) as temporary:
+        with h5py.File(path.name, "w", driver="core", backing_store=False) as file:
+            yield file
+            file.flush()
+            content = file.id.get_file_image()
         try:
-            opened = stack.enter_context(create_hdf5(temporary))
+            temporary.write_bytes(content)
         except OSError as error:
             raise WorkspaceError(why_not(error, path, "written")) from error
-        yield opened
 
 
 def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
@@ -314,12 +319,11 @@ def write_pairs(path: Path, pairs: Iterable[OANetPair]) -> int:
         Number of pairs written.
     """
     count = 0
-    with new_pairs_file(path) as (handle, check):
+    with new_pairs_file(path) as handle:
         for name in (*_REQUIRED, "log_scale_ratios", "rotations", "sizes", "scenes"):
             handle.create_group(name)
         for count, pair in enumerate(pairs, start=1):
             _write_pair(handle, str(count - 1), pair)
-            check()
     return count
 
 
