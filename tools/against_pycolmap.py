@@ -92,7 +92,9 @@ def measure(images: Path, method: str, num_features: int, cores: set[int]) -> di
             command = [sys.executable, "-m", "corrsfm", "-q", "run", images, out]
             command += ["--method", method, "--max-features", num_features]
         wall, processor = timed([str(word) for word in command], cores)
-        report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+        # A run that failed leaves no report, and counts as one without a model.
+        path = out / "report.json"
+        report = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"stage_seconds": {}}
         return {
             "cores": len(cores),
             **largest_model(out),

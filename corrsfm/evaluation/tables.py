@@ -214,11 +214,11 @@ def _scene_table(values: dict[str, Any]) -> Table:
 
 
 _PYCOLMAP_STAGES = {
-    "extract": ("features",),
-    "match": ("matches",),
-    "prune": ("pruned matches",),
-    "verify": ("verified matches",),
-    "map": ("models",),
+    "extract": "features",
+    "match": "matches",
+    "prune": "pruned matches",
+    "verify": "verified matches",
+    "map": "models",
 }
 
 
@@ -230,10 +230,7 @@ def _pycolmap_table(values: dict[str, Any]) -> Table:
     totals: dict[str, list[float]] = {}
     for row in single:
         beside = parallel[row["scene"], row["method"]]
-        stages = [
-            sum(row["stage_seconds"].get(stage, 0.0) for stage in names)
-            for names in _PYCOLMAP_STAGES.values()
-        ]
+        stages = [row["stage_seconds"].get(stage, 0.0) for stage in _PYCOLMAP_STAGES.values()]
         numbers = [*stages, row["seconds"], row["processor_seconds"], beside["seconds"]]
         sums = totals.setdefault(row["method"], [0.0] * len(numbers))
         totals[row["method"]] = [total + number for total, number in zip(sums, numbers, strict=True)]

@@ -6,7 +6,7 @@ block size, number of threads or device, and equal distances compare equal. (bfl
 the bytes, but not the sums.) Among equal distances the lowest keypoint index wins.
 
 A processor that multiplies bytes exactly (AVX-512 VNNI) gets bytes: 10 ms of one core for a pair of 4,096
-SIFT descriptors, 52 ms by float32. On processors numpy searches the products, because its `argmin` takes a
+SIFT descriptors, 52 ms by float32. On a CPU numpy searches the products, because its `argmin` takes a
 tenth of torch's time.
 """
 
@@ -165,10 +165,11 @@ def _search_on_cpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Ne
     none = np.iinfo(dtype).max if dtype == np.int32 else np.inf
     best, second, best_back = (np.full(num, none, dtype) for num in (num0, num0, num1))
     index = np.zeros(num0, np.int64)
+    num_rows = min(block_size, CPU_BLOCK_ROWS)
     for start1 in range(0, num1, block_size):
         columns = slice(start1, min(start1 + block_size, num1))
-        for start0 in range(0, num0, min(block_size, CPU_BLOCK_ROWS)):
-            rows = slice(start0, min(start0 + min(block_size, CPU_BLOCK_ROWS), num0))
+        for start0 in range(0, num0, num_rows):
+            rows = slice(start0, min(start0 + num_rows, num0))
             distances = _distances_on_cpu(image0, image1, rows, columns)
             np.minimum(best_back[columns], distances.min(axis=0), out=best_back[columns])
             found = distances.argmin(axis=1)  # the first of equals
