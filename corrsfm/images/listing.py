@@ -144,8 +144,10 @@ def holds_pictures(folder: Path) -> bool:
 
 
 def _refuse(error: OSError) -> None:
-    """A folder that cannot be looked into may hold photos."""
+    """A folder that cannot be looked into may hold photos; one that is gone by now holds none."""
     path = Path(error.filename)
+    if isinstance(error, FileNotFoundError) and not os.path.lexists(path):
+        return
     if is_closed(path):
         raise InputError(opening(path)) from error
     raise InputError(f"{path}: cannot be looked into ({error.strerror}); open it, or move it away") from error

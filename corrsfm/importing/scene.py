@@ -21,7 +21,7 @@ from corrsfm.images.stage import index_photos
 from corrsfm.importing import Source
 from corrsfm.importing.database import open_database
 from corrsfm.importing.hloc import open_hloc
-from corrsfm.types import Features, ImageRecord, Matches, Pair, PairList
+from corrsfm.types import Features, ImageRecord, Matches, Pair
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import (
     fingerprint_of_imported,
@@ -228,8 +228,7 @@ def _write(source: Source, files: cfg.ImportedConfig, workspace: Workspace, inde
         inputs={"images": workspace.require("images").fingerprint}, overwrite=False, unit="photo",
     )  # fmt: skip
     if pairs:
-        origins = tuple(("import",) for _ in pairs)
-        record_imported_pairs(workspace, PairList(pairs=tuple(pairs), origins=origins), config)
+        record_imported_pairs(workspace, pairs, config)
         inputs = {stage: workspace.require(stage).fingerprint for stage in ("features", "pairs")}
         complete(
             workspace, "matches", matches_of(workspace), wanted_pairs,

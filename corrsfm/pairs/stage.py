@@ -16,7 +16,7 @@ from corrsfm.workspace import Workspace
 from corrsfm.workspace.imported import drop_foreign_record, imported_from, record_imported_pairs
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
-from corrsfm.workspace.stores import features_of
+from corrsfm.workspace.stores import features_of, matches_of
 from corrsfm.workspace.warned import keeps_warnings
 
 __all__ = ["fingerprint_of", "make_pairs"]
@@ -80,11 +80,13 @@ def make_pairs(
 
 
 def _keep_imported(workspace: Workspace, source: cfg.ImportedConfig, names: list[str]) -> StageOutcome:
-    """Keep the pairs of imported matches, there are no others; photos that are gone take theirs along."""
-    known = read_pairs(workspace)
-    pair_list = _without({name for pair in known.pairs for name in pair} - set(names), known)
+    """The pairs of imported matches of the photos that are there; those of others wait for their return."""
+    photos = set(names)
+    known = {tuple(text.split("\t")) for text in matches_of(workspace).texts()}
+    known.update(read_pairs(workspace).pairs)
+    pairs = sorted((pair[0], pair[1]) for pair in known if len(pair) == 2 and photos.issuperset(pair))
+    pair_list = record_imported_pairs(workspace, pairs, source)
     _warn_if_disconnected(names, pair_list)
-    record_imported_pairs(workspace, pair_list, source)
     return StageOutcome(stage="pairs", num_items=len(pair_list), num_reused=len(pair_list), skipped=True)
 
 

@@ -8,6 +8,7 @@ lost its manifest, or an import that was killed, is not taken for one that has n
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 from corrsfm import config as cfg
@@ -116,8 +117,11 @@ def imported_matches(workspace: Workspace) -> dict[Pair, str]:
     return matches_of(workspace).fingerprints(read_pairs(workspace).pairs)
 
 
-def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg.ImportedConfig) -> None:
-    """Write the pairs of imported matches and record them as made by the import."""
+def record_imported_pairs(
+    workspace: Workspace, pairs: Sequence[Pair], source: cfg.ImportedConfig
+) -> PairList:
+    """Write the pairs of imported matches, sorted, and record them as made by the import."""
+    pair_list = PairList(pairs=tuple(pairs), origins=tuple(("import",) for _ in pairs))
     features = workspace.require("features").fingerprint
     write_pairs(workspace, pair_list)
     workspace.finish(
@@ -129,6 +133,7 @@ def record_imported_pairs(workspace: Workspace, pair_list: PairList, source: cfg
             num_items=len(pair_list),
         ),
     )
+    return pair_list
 
 
 def traits_of(workspace: Workspace) -> cfg.MatchTraits:

@@ -159,6 +159,11 @@ class ItemReader(ABC, Generic[K, T]):
         with self._reading() as connection, self._errors():
             return {key: int(value or 0) for key, value in connection.execute(query, (name,))}
 
+    def texts(self) -> list[str]:
+        """The texts of the keys of all items, sorted; not held against checksums."""
+        with self._reading() as connection, self._errors():
+            return sorted(str(key) for (key,) in connection.execute("SELECT key FROM items"))
+
     def finished(self, wanted: Mapping[K, str]) -> set[K]:
         """Keys whose item is there with the wanted fingerprint."""
         if not self.path.exists():

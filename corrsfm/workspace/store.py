@@ -82,6 +82,8 @@ class ItemStore(ItemReader[K, T]):
     def commit(self, wanted: Mapping[K, str], seal: str = "", *, known: Set[K] = frozenset()) -> None:
         """Finish the file: it then holds exactly the wanted items, on the disk.
 
+        Only imported ones that are not wanted stay: nothing could make them again.
+
         Parameters
         ----------
         wanted : mapping
@@ -104,7 +106,7 @@ class ItemStore(ItemReader[K, T]):
                 )
         with self._errors(), transaction(connection):
             (num,) = connection.execute("SELECT count(*) FROM items").fetchone()
-            if num != len(wanted):
+            if num != len(wanted) and not self._about(connection).get("origin"):
                 texts = {self.kind.key(key) for key in wanted}
                 held = connection.execute("SELECT key FROM items").fetchall()
                 for key in [key for (key,) in held if key not in texts]:

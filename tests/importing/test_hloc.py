@@ -127,6 +127,24 @@ def test_matches_come_in_and_are_not_made_again(
             pipeline.prune_matches(workspace, cfg.PruneConfig(method=method), RUN)
 
 
+def test_what_was_imported_of_photos_that_are_left_out_waits_for_their_return(
+    photos: Path, features: Path, tmp_path: Path, names: list[str]
+) -> None:
+    pairs = [(names[0], names[1]), (names[0], names[2])]
+    write_matches(tmp_path / "matches.h5", pairs)
+    import_features(photos, tmp_path / "scene", features=features, matches=tmp_path / "matches.h5")
+    workspace = Workspace(tmp_path / "scene")
+    (tmp_path / "two.txt").write_text(f"{names[0]}\n{names[1]}\n")
+    for image_list, wanted in ((tmp_path / "two.txt", pairs[:1]), (None, pairs)):
+        pipeline.index_photos(workspace, photos, cfg.ImagesConfig(image_list=image_list), RUN)
+        pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN)
+        pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+        pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN)
+        scene = corrsfm.open_workspace(tmp_path / "scene")
+        assert scene.pairs == tuple(wanted)
+        assert [len(scene.matches(pair)) for pair in wanted] == [NUM // 2] * len(wanted)
+
+
 def test_options_for_other_features_are_refused_before_any_work(
     photos: Path, features: Path, tmp_path: Path
 ) -> None:

@@ -95,7 +95,7 @@ def test_the_command_to_run_has_the_recorded_options_quoted_for_the_shell(tmp_pa
 @pytest.mark.parametrize("stage", STAGE_COMMANDS)
 def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspace, stage: str) -> None:
     others: dict[type, object] = {bool: True, int: 99, float: 0.5, str: "f,x,y"}
-    not_given = {"max_ratio": 0.7}  # where None stands for a number, and not for a path
+    not_given = {"max_ratio": 0.7, "max_candidates": 99}  # where None stands for a number, and not for a path
     num_flags = 0
     for name, options in (
         ("images", cfg.ImagesConfig), ("features", cfg.FeaturesConfig), ("pairs", cfg.PairsConfig),
@@ -109,8 +109,6 @@ def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspa
                 changed[key] = others.get(type(value), not_given.get(key, "x"))
             if isinstance(value, bool):
                 changed[key] = not value
-            if key == "max_ratio":  # a number that is None by default
-                changed[key] = 0.5
             num_flags += changed[key] != value
         workspace.finish(name, StageRecord(fingerprint="f", config=changed))
     assert num_flags > 20
