@@ -1,13 +1,8 @@
-"""Descriptors of two photos → putative matches: nearest neighbours by blocked matrix products.
+"""Descriptors of two photos → putative matches: nearest neighbours, by exact distances (`corrsfm.distances`).
 
-Descriptors are whole numbers (`corrsfm.descriptors`: bytes, or unit vectors in small steps), so all products
-and sums that make a squared distance are integers that float32 holds exactly: the result does not depend on
-block size, number of threads or device, and equal distances compare equal. (bfloat16 and float16 could hold
-the bytes, but not the sums.) Among equal distances the lowest keypoint index wins.
-
-A processor that multiplies bytes exactly (AVX-512 VNNI) gets bytes: 10 ms of one core for a pair of 4,096
-SIFT descriptors, 52 ms by float32. On a CPU numpy searches the products, because its `argmin` takes a
-tenth of torch's time.
+Among equal distances the lowest keypoint index wins. A pair of 4,096 SIFT descriptors takes 10 ms of one core
+where bytes are multiplied, and 52 ms by float32. On a CPU numpy searches the distances, because its `argmin`
+takes a tenth of torch's time.
 """
 
 from __future__ import annotations
@@ -15,20 +10,16 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from corrsfm.config import MatchesConfig
-from corrsfm.descriptors import as_integers
+from corrsfm.distances import CPU_BLOCK_ROWS, PreparedDescriptors, distances_on_cpu, distances_on_gpu
 from corrsfm.types import Matches
 
 __all__ = ["Matcher", "match_features"]
-
-# Rows compared at a time on a CPU: the block then stays in the cache between its reductions.
-CPU_BLOCK_ROWS = 256
 
 
 def match_features(
@@ -57,7 +48,9 @@ def match_features(
         keypoint or both distances are zero.
     """
     target = torch.device(device)
-    return _match(_Prepared(descriptors0, target), _Prepared(descriptors1, target), block_size)
+    return _match(
+        PreparedDescriptors(descriptors0, target), PreparedDescriptors(descriptors1, target), block_size
+    )
 
 
 class Matcher:
@@ -88,55 +81,24 @@ class Matcher:
         self._device = torch.device(device)
         self._block_size = block_size
         self._max_cached = max(2, max_cached_images)
-        self._cache: OrderedDict[str, _Prepared] = OrderedDict()
+        self._cache: OrderedDict[str, PreparedDescriptors] = OrderedDict()
         self._lock = threading.Lock()
 
     def match(self, name0: str, name1: str) -> Matches:
         """Putative matches of a pair of images; the same as `match_features` on their descriptors."""
         return _match(self._prepared(name0), self._prepared(name1), self._block_size)
 
-    def _prepared(self, name: str) -> _Prepared:
+    def _prepared(self, name: str) -> PreparedDescriptors:
         with self._lock:
             if name not in self._cache:
-                self._cache[name] = _Prepared(self._load(name), self._device)
+                self._cache[name] = PreparedDescriptors(self._load(name), self._device)
                 if len(self._cache) > self._max_cached:
                     self._cache.popitem(last=False)
             self._cache.move_to_end(name)
             return self._cache[name]
 
 
-class _Prepared:
-    """Descriptors of one image on the device, as bytes less 128 where those are multiplied exactly."""
-
-    def __init__(self, descriptors: NDArray, device: torch.device) -> None:
-        if descriptors.dtype == np.uint8 and device.type == "cpu" and _multiplies_bytes():
-            # A shift of both sides leaves their distances as they are.
-            values = torch.from_numpy((descriptors ^ np.uint8(128)).view(np.int8))
-            self.squared = values.int().square().sum(dim=1, dtype=torch.int32)  # (N,)
-        else:
-            values = torch.from_numpy(np.ascontiguousarray(as_integers(descriptors))).to(device)
-            self.squared = values.square().sum(dim=1)
-        self.values = values  # (N, D)
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-
-@cache
-def _multiplies_bytes() -> bool:
-    """Whether torch multiplies signed bytes fast on this processor, and exactly at the extremes.
-
-    Older instructions for bytes saturate at 16 bits, so without the newer ones nobody asks.
-    """
-    multiply = getattr(torch, "_int_mm", None)
-    if multiply is None or not getattr(torch.cpu, "_is_vnni_supported", bool)():
-        return False
-    signs = torch.tensor([[-128, -128], [127, -128], [127, 127]], dtype=torch.int8).repeat(1, 64)
-    exact = signs.int() @ signs.int().T
-    return bool(torch.equal(multiply(signs, signs.T), exact))
-
-
-def _match(image0: _Prepared, image1: _Prepared, block_size: int) -> Matches:
+def _match(image0: PreparedDescriptors, image1: PreparedDescriptors, block_size: int) -> Matches:
     if len(image0) == 0 or len(image1) == 0:
         return Matches(
             indices=np.zeros((0, 2), np.int32), ratios=np.zeros(0, np.float32), mutual=np.zeros(0, np.bool_)
@@ -156,10 +118,8 @@ _Nearest = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 """Of each keypoint of image 0 the squared distances (N0,) to its two nearest in image 1, float64 and infinite
 for none, and the index of the nearest; of each of image 1 the squared distance (N1,) to its nearest."""
 
-_scratch = threading.local()
 
-
-def _search_on_cpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Nearest:
+def _search_on_cpu(image0: PreparedDescriptors, image1: PreparedDescriptors, block_size: int) -> _Nearest:
     num0, num1 = len(image0), len(image1)
     dtype = image0.squared.numpy().dtype
     none = np.iinfo(dtype).max if dtype == np.int32 else np.inf
@@ -170,7 +130,7 @@ def _search_on_cpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Ne
         columns = slice(start1, min(start1 + block_size, num1))
         for start0 in range(0, num0, num_rows):
             rows = slice(start0, min(start0 + num_rows, num0))
-            distances = _distances_on_cpu(image0, image1, rows, columns)
+            distances = distances_on_cpu(image0, image1, rows, columns)
             np.minimum(best_back[columns], distances.min(axis=0), out=best_back[columns])
             found = distances.argmin(axis=1)  # the first of equals
             each = np.arange(len(distances))
@@ -188,27 +148,7 @@ def _search_on_cpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Ne
     return first, runner_up, torch.from_numpy(index), back
 
 
-def _distances_on_cpu(image0: _Prepared, image1: _Prepared, rows: slice, columns: slice) -> NDArray:
-    """(rows, columns) squared Euclidean distances, exact, in memory that the thread's next block takes.
-
-    Fresh memory for each block would cost more than the product of bytes.
-    """
-    shape = rows.stop - rows.start, columns.stop - columns.start
-    dtype = image0.squared.dtype
-    memory = getattr(_scratch, "memory", None)
-    if memory is None or memory.dtype != dtype or len(memory) < shape[0] * shape[1]:
-        memory = _scratch.memory = torch.empty(shape[0] * shape[1], dtype=dtype)
-    block = memory[: shape[0] * shape[1]].view(shape)
-    values0, values1, squared1 = image0.values[rows], image1.values[columns].T, image1.squared[columns]
-    if dtype == torch.int32:
-        torch._int_mm(values0, values1, out=block)
-        torch.sub(squared1, block, alpha=2, out=block)
-    else:
-        torch.addmm(squared1, values0, values1, alpha=-2, out=block)
-    return block.add_(image0.squared[rows, None]).numpy()
-
-
-def _search_on_gpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Nearest:
+def _search_on_gpu(image0: PreparedDescriptors, image1: PreparedDescriptors, block_size: int) -> _Nearest:
     num0, num1 = len(image0), len(image1)
     device = image0.values.device
     best = torch.full((num0,), torch.inf, dtype=image0.squared.dtype, device=device)
@@ -219,16 +159,10 @@ def _search_on_gpu(image0: _Prepared, image1: _Prepared, block_size: int) -> _Ne
         columns = slice(start1, min(start1 + block_size, num1))
         for start0 in range(0, num0, block_size):
             rows = slice(start0, min(start0 + block_size, num0))
-            distances = _distances_on_gpu(image0, image1, rows, columns)
+            distances = distances_on_gpu(image0, image1, rows, columns)
             best_back[columns] = torch.minimum(best_back[columns], distances.amin(dim=0))
             _update_two_nearest(distances, best[rows], second[rows], index[rows], start1)
     return best.double(), second.double(), index, best_back.double()
-
-
-def _distances_on_gpu(image0: _Prepared, image1: _Prepared, rows: slice, columns: slice) -> torch.Tensor:
-    """(rows, columns) squared Euclidean distances, exact."""
-    distances = torch.addmm(image1.squared[columns], image0.values[rows], image1.values[columns].T, alpha=-2)
-    return distances.add_(image0.squared[rows, None])
 
 
 def _update_two_nearest(

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.descriptors import as_integers
 from corrsfm.reconstruction.epipolar import TwoViews
 from corrsfm.reconstruction.views import Rays, Views, rays_of
 from corrsfm.types import Pair
@@ -24,11 +23,9 @@ __all__ = ["NeighbourTables", "Neighbours", "nearest_descriptors", "predict", "p
 NUM_NEIGHBOURS = 12
 MAX_LINE_DISTANCE_PX = 3.0
 MAX_RATIO = 0.85
-# A pair of 4,096 features takes 0.4 MB at most and 0.2 s, about as long as matching it.
+# A pair of 4,096 features takes 0.4 MB at most and 20 ms, twice as long as matching it.
 MIN_SAMPLE = 300
 PAIRS_PER_PHOTO = 2
-# Rows whose distances are held at a time; the block then stays in the cache.
-_BLOCK_ROWS = 256
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,12 +51,10 @@ class Neighbours:
 def nearest_descriptors(
     descriptors0: NDArray, descriptors1: NDArray, num: int = NUM_NEIGHBOURS
 ) -> Neighbours:
-    """Nearest descriptors by blocked matrix products.
+    """Nearest descriptors, by exact distances (`corrsfm.distances`): the same on every machine.
 
     Keypoints whose nearest descriptor fails the ratio against the last of them are left out: no model can
     make a match of them. In most pairs these are most keypoints.
-
-    All sums are integers (`corrsfm.descriptors`), so the result does not depend on the machine.
 
     Parameters
     ----------
@@ -73,19 +68,17 @@ def nearest_descriptors(
     Neighbours
         ``min(num, N1)`` for each keypoint that is left.
     """
-    columns: NDArray[np.floating] = np.ascontiguousarray(as_integers(descriptors1).T)
-    squared1 = np.sum(columns**2, axis=0)
-    num = min(num, len(descriptors1))
+    # Imported late because it loads torch.
+    from corrsfm.distances import CPU_BLOCK_ROWS, PreparedDescriptors, distances_on_cpu
+
+    photo0, photo1 = PreparedDescriptors(descriptors0), PreparedDescriptors(descriptors1)
+    num = min(num, len(photo1))
     keypoints = [np.zeros(0, np.int32)]
     indices = [np.zeros((0, num), np.int32)]
     distances_sq = [np.zeros((0, num), np.float32)]
-    if num < 2:
-        return Neighbours(keypoints=keypoints[0], indices=indices[0], distances_sq=distances_sq[0])
-    for start in range(0, len(descriptors0), _BLOCK_ROWS):
-        rows = as_integers(descriptors0[start : start + _BLOCK_ROWS])
-        block: NDArray[np.floating] = (-2 * rows) @ columns
-        block += squared1
-        block += np.sum(rows**2, axis=1)[:, None]
+    for start in range(0, len(photo0) if num > 1 else 0, CPU_BLOCK_ROWS):
+        rows = slice(start, min(start + CPU_BLOCK_ROWS, len(photo0)))
+        block = distances_on_cpu(photo0, photo1, rows, slice(0, len(photo1)))
         chosen = _smallest(block, num)
         nearest = np.take_along_axis(block, chosen, axis=1)
         useful = np.flatnonzero(nearest[:, 0] < MAX_RATIO**2 * nearest[:, -1])
@@ -102,7 +95,8 @@ def nearest_descriptors(
 def _smallest(values: NDArray, num: int) -> NDArray[np.intp]:
     """Columns of the smallest values of each row in order, (R, num); the lower column among equals."""
     limit = np.partition(values, num - 1, axis=1)[:, num - 1 : num]
-    row, column = np.nonzero(values <= limit)
+    # Ten times as fast as nonzero in two dimensions.
+    row, column = np.divmod(np.flatnonzero(values <= limit), values.shape[1])
     counts = np.bincount(row, minlength=len(values))
     if (counts > num).any():
         # Equals at the limit: order everything that was found, then cut.

@@ -5,8 +5,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from corrsfm import distances
 from corrsfm.descriptors import as_integers
-from corrsfm.matches import nearest
 from corrsfm.matches.nearest import Matcher, match_features
 
 
@@ -39,10 +39,10 @@ def plain_matches(
 @pytest.fixture(params=["bytes", "floats"])
 def products(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Both ways to multiply, whichever this processor takes."""
-    exact = nearest._multiplies_bytes()
+    exact = distances._multiplies_bytes()
     if request.param == "bytes" and not exact:
         pytest.skip("this processor does not multiply bytes exactly")
-    monkeypatch.setattr(nearest, "_multiplies_bytes", lambda: request.param == "bytes")
+    monkeypatch.setattr(distances, "_multiplies_bytes", lambda: request.param == "bytes")
 
 
 @pytest.mark.usefixtures("products")
@@ -98,11 +98,11 @@ def test_equal_distances_take_the_lowest_index_and_ratio_one() -> None:
 
 @pytest.mark.parametrize("num", [1, 5, 300])
 def test_bytes_and_floats_give_the_same_bits(monkeypatch: pytest.MonkeyPatch, num: int) -> None:
-    if not nearest._multiplies_bytes():
+    if not distances._multiplies_bytes():
         pytest.skip("this processor does not multiply bytes exactly")
     pair = descriptors(700, 0), descriptors(num, 1)
     by_bytes = match_features(*pair)
-    monkeypatch.setattr(nearest, "_multiplies_bytes", bool)
+    monkeypatch.setattr(distances, "_multiplies_bytes", bool)
     by_floats = match_features(*pair)
     for name in ("indices", "ratios", "mutual"):
         assert getattr(by_bytes, name).tobytes() == getattr(by_floats, name).tobytes()
@@ -114,7 +114,7 @@ def test_a_product_that_saturates_is_not_used(monkeypatch: pytest.MonkeyPatch) -
 
     monkeypatch.setattr(torch, "_int_mm", saturates)
     monkeypatch.setattr(torch.cpu, "_is_vnni_supported", lambda: True)
-    assert not nearest._multiplies_bytes.__wrapped__()
+    assert not distances._multiplies_bytes.__wrapped__()
 
 
 @pytest.mark.usefixtures("products")
