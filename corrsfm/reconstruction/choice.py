@@ -134,10 +134,11 @@ class Choice:
 
 def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
     """Whether a first model needs no second: it explains enough, fixes the photos, misplaces none."""
+    explained = model.explained
     return (
         not model.is_open
-        and not model.explained.misplaced
-        and model.explained.is_enough(model.explained_share)
+        and not explained.misplaced
+        and (explained.is_enough(explained.share) or explained.is_enough_of_supported)
         and model.num_registered >= policy.min_registered_share * num_photos
     )
 

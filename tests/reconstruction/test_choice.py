@@ -92,6 +92,19 @@ def test_less_needs_to_be_explained_where_no_pair_contradicts_the_model() -> Non
     assert objecting.contradicted and not objecting.is_enough(objecting.share)
 
 
+def test_false_pairs_do_not_count_against_a_model_that_explains_the_others() -> None:
+    explained = tried("first", RIGHT).explained
+    others = [dataclasses.replace(pair, num_verified=100, num_explained=97) for pair in explained.pairs[1:]]
+    for num_false, num_explained, enough in ((60, 97, True), (60, 94, False), (80, 97, False)):
+        false = dataclasses.replace(explained.pairs[0], num_verified=num_false, num_explained=0)
+        pairs = (false, *(dataclasses.replace(pair, num_explained=num_explained) for pair in others))
+        model = dataclasses.replace(
+            tried("first", RIGHT), explained=dataclasses.replace(explained, pairs=pairs)
+        )
+        assert model.explained_share < 0.94 and not model.explained.misplaced
+        assert good_enough(model, 4, POLICY) is enough
+
+
 def test_the_right_model_is_chosen_among_bent_ones_and_confirmed_by_another_right_one() -> None:
     bank = [
         tried("b", BENT_OTHERWISE),
