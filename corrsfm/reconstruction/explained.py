@@ -28,9 +28,9 @@ CONTRADICTED_BELOW = 0.5
 # geometries hold false matches that no model explains: the exact cameras of the sample scene courtyard
 # explain 88 %. Then no pair is contradicted, while a photo in the wrong place contradicts several.
 ENOUGH_SHARE, ENOUGH_UNCONTRADICTED_SHARE = 0.94, 0.85
-# Photos that share nothing make false pairs, which every right model contradicts. Of all models of 20 training,
-# validation and sample scenes with three methods of pruning, right ones explain 95.6 % and more of the pairs
-# that they do not contradict, those of repeating texture left aside, and wrong ones 94.0 % at most.
+# Photos that share nothing make false pairs, which every right model contradicts. Of the models of 20
+# training, validation and sample scenes with three methods of pruning, right ones explain 95.6 % and more
+# of the pairs that they do not contradict, those of repeating texture left aside, and wrong ones 94.0 %.
 ENOUGH_SUPPORTED_SHARE, MOST_CONTRADICTED = 0.955, 0.12
 MISPLACED_BELOW = 0.6
 
