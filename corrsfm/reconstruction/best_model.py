@@ -27,6 +27,7 @@ from corrsfm.reconstruction.candidates import (
     MapperKind,
     StartingCameras,
     candidate_bank,
+    has_unknown_focal_lengths,
     map_candidate,
 )
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
@@ -208,12 +209,18 @@ def select_model(
     models: dict[str, pycolmap.Reconstruction] = {}
 
     def tried(
-        name: str, model: pycolmap.Reconstruction, seconds: float, *, has_more_cameras: bool = False
+        name: str,
+        model: pycolmap.Reconstruction,
+        seconds: float,
+        *,
+        way: str = MapperKind.INCREMENTAL,
+        has_more_cameras: bool = False,
     ) -> Tried:
         models[name] = model
         views = views_of(model)
         return Tried(
             name=name,
+            way=way,
             views=views,
             explained=evidence.explain(views),
             seconds=seconds,
@@ -224,7 +231,12 @@ def select_model(
         others_share = cameras_on_trial is StartingCameras.SHARED
         return cameras is StartingCameras.SEPARATE or (others_share and cameras is not cameras_on_trial)
 
-    bank = candidate_bank(seed=seed, on_trial=cameras_on_trial, refinement=refinement)
+    bank = candidate_bank(
+        seed=seed,
+        on_trial=cameras_on_trial,
+        calibrate=has_unknown_focal_lengths(database),
+        refinement=refinement,
+    )
     cameras_of = {candidate.name: candidate.cameras for candidate in bank}
     with CandidatePool(
         database,
@@ -243,6 +255,7 @@ def select_model(
                     one.name,
                     model,
                     pool.seconds(one),
+                    way=one.mapper,
                     has_more_cameras=has_more_cameras(one.cameras),
                 )
                 for one, model in outcomes
@@ -263,7 +276,7 @@ def select_model(
             name = model.name + _MENDED
             # It may have photos to register once more.
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
-            return tried(name, again, first_seconds, has_more_cameras=model.has_more_cameras)
+            return tried(name, again, first_seconds, way=model.way, has_more_cameras=model.has_more_cameras)
 
         start, others = None, []
         if first is not None:
@@ -363,6 +376,7 @@ def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first
     verified = {pair: matches for pair, matches in evidence.verified.items() if pair not in left_out}
     chosen = Tried(
         name="-".join(["unfolded", *attempt.rules]),
+        way=MapperKind.INCREMENTAL,
         views=views,
         explained=explain(views, evidence.keypoints, verified),
         seconds=first_seconds,
@@ -392,7 +406,13 @@ def judge_as_it_is(
         What to call it in the record, and why nothing else was tried.
     """
     views = views_of(model)
-    chosen = Tried(name=name, views=views, explained=evidence.explain(views), seconds=0.0)
+    chosen = Tried(
+        name=name,
+        way=MapperKind.INCREMENTAL,
+        views=views,
+        explained=evidence.explain(views),
+        seconds=0.0,
+    )
     choice = Choice(chosen=chosen, tried=(chosen,), reason=reason)
     folds = judge_model(model, evidence.verified).evidence
     return Selection(

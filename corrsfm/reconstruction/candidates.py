@@ -38,6 +38,7 @@ __all__ = [
     "candidate_bank",
     "change_cameras",
     "find_cameras_on_trial",
+    "has_unknown_focal_lengths",
     "incremental_options",
     "map_candidate",
 ]
@@ -103,6 +104,7 @@ def candidate_bank(
     *,
     seed: int,
     on_trial: StartingCameras | None,
+    calibrate: bool,
     num_seeds: int = 3,
     refinement: Refinement = DEFAULT_REFINEMENT,
 ) -> list[Candidate]:
@@ -114,6 +116,9 @@ def candidate_bank(
         Of the first model; the others count up from it.
     on_trial : StartingCameras or None
         Other cameras to try as well, see `find_cameras_on_trial`.
+    calibrate : bool
+        Try calibrated cameras as well. Where focal lengths are known, by EXIF or the votes of pairs,
+        calibration leaves them as they are, and its candidates would be the others once more.
     num_seeds : int
         How often each kind is tried.
     refinement : Refinement
@@ -126,7 +131,8 @@ def candidate_bank(
         # Before the others confirm a model that only ever had a camera for each photo.
         if on_trial:
             sources.insert(0 if on_trial is StartingCameras.SHARED else 1, on_trial)
-        sources += [StartingCameras.CALIBRATED]
+        if calibrate:
+            sources.append(StartingCameras.CALIBRATED)
     else:
         kinds.remove(MapperKind.HELD)
     bank = [
@@ -245,6 +251,13 @@ def find_cameras_on_trial(database: Path) -> StartingCameras | None:
     if _has_twice((camera.width, camera.height) for camera in unknown):
         return StartingCameras.SHARED
     return None
+
+
+def has_unknown_focal_lengths(database: Path) -> bool:
+    """Whether the focal length of any photo is but a guess."""
+    with colmap_log(), database_errors(database), pycolmap.Database.open(database) as tables:
+        known = {camera.camera_id: camera.has_prior_focal_length for camera in tables.read_all_cameras()}
+        return any(not known[image.camera_id] for image in tables.read_all_images())
 
 
 def _has_twice(values: Iterable[Hashable]) -> bool:

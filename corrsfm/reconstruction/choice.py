@@ -56,8 +56,8 @@ class ChoicePolicy:
     min_registered_share: float = 1.0
     max_models: int = 24
     max_time_factor: float = 25.0
-    round_size: int = 4
-    min_models: int = 9
+    round_size: int = 3
+    min_models: int = 7
     confirming_share: float = 0.9
     confirming_predicted: float = 0.97
     patience: int = 12
@@ -71,6 +71,9 @@ class Tried:
     ----------
     name : str
         Of the candidate.
+    way : str
+        How it was mapped. Only a model that was mapped in another way confirms it: one more seed of the same
+        mapper often gives the same model, right or wrong.
     views : mapping of str to View
         Its registered photos.
     explained : Explained
@@ -85,6 +88,7 @@ class Tried:
     """
 
     name: str
+    way: str
     views: Views
     explained: Explained
     seconds: float
@@ -117,9 +121,9 @@ class Choice:
     reason : str
         Why no more was tried, as the end of "stopped because …".
     support : float or None
-        Best agreement of another candidate with the chosen one, among those that predict nearly as much:
-        share of relative poses in [0, 1]. None if only the first model was looked at, 0 if the others
-        predict less.
+        Best agreement of another candidate with the chosen one, among those that were mapped in another way
+        and predict nearly as much: share of relative poses in [0, 1]. None if only the first model was looked
+        at, 0 if the others predict less.
     could_try_more : bool
         Whether a larger `ChoicePolicy.max_models` would have brought another candidate.
     """
@@ -262,11 +266,11 @@ def _best(tried: Sequence[Tried]) -> Tried:
 
 
 def _support(best: Tried, tried: Sequence[Tried], confirming_predicted: float) -> float:
-    """Best agreement with another model that predicts nearly as much, over all photos of the best."""
+    """Best agreement with a model mapped in another way that predicts nearly as much, over all its photos."""
     enough = confirming_predicted * (best.num_predicted or 0)
     shares = [0.0]
     for rival in tried:
-        if rival is best or (rival.num_predicted or 0) < enough:
+        if rival.way == best.way or (rival.num_predicted or 0) < enough:
             continue
         common = agreement(best.views, rival.views)
         # A rival with fewer photos confirms only the pairs it has.

@@ -112,7 +112,7 @@ def test_a_candidate_stands_in_for_a_first_model_that_did_not_come(scene: Scene)
 def test_all_that_the_round_of_a_stand_in_mapped_is_chosen_from(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rounds = [[None, bent(scene.truth), scene.truth, None]]
+    rounds = [[None, bent(scene.truth), scene.truth]]
     monkeypatch.setattr(
         best_model.CandidatePool, "map", lambda _, bank: rounds.pop() if rounds else [None] * len(bank)
     )
@@ -204,7 +204,7 @@ def test_the_record_is_plain_and_tells_the_choice(scene: Scene) -> None:
 def test_the_record_tells_which_matches_of_contradicted_pairs_are_explained(scene: Scene) -> None:
     views = views_of(bent(scene.truth))
     explained = scene.evidence.explain(views)
-    chosen = Tried(name="bent", views=views, explained=explained, seconds=1.0)
+    chosen = Tried(name="bent", way="incremental", views=views, explained=explained, seconds=1.0)
     selected = scene.select(None)
     assert selected is not None and explained.contradicted
     choice = dataclasses.replace(selected.choice, chosen=chosen)

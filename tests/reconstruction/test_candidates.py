@@ -17,6 +17,7 @@ from corrsfm.reconstruction.candidates import (
     candidate_bank,
     change_cameras,
     find_cameras_on_trial,
+    has_unknown_focal_lengths,
     map_candidate,
 )
 from corrsfm.reconstruction.views import views_of
@@ -34,7 +35,7 @@ def spoil_focal_length(path: Path, factor: float) -> float:
 
 
 def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
-    bank = candidate_bank(seed=5, on_trial=StartingCameras.SEPARATE, num_seeds=2)
+    bank = candidate_bank(seed=5, on_trial=StartingCameras.SEPARATE, calibrate=True, num_seeds=2)
     assert len(bank) == len({candidate.name for candidate in bank}) == 2 * 3 * 4 - 1
     assert Candidate(mapper=MapperKind.INCREMENTAL, seed=5) not in bank
     assert {candidate.seed for candidate in bank} == {5, 6}
@@ -42,18 +43,31 @@ def test_the_bank_holds_every_candidate_once_and_not_the_first_model() -> None:
 
 
 def test_a_shared_camera_is_tried_before_one_for_each_photo_confirms_itself() -> None:
-    bank = candidate_bank(seed=5, on_trial=StartingCameras.SHARED)
+    bank = candidate_bank(seed=5, on_trial=StartingCameras.SHARED, calibrate=True)
     assert {candidate.cameras for candidate in bank[:4]} == {StartingCameras.SHARED}
 
 
 def test_other_cameras_are_tried_only_where_they_are_on_trial() -> None:
-    bank = candidate_bank(seed=0, on_trial=None)
+    bank = candidate_bank(seed=0, on_trial=None, calibrate=True)
     assert {candidate.cameras for candidate in bank} == {StartingCameras.AS_IS, StartingCameras.CALIBRATED}
     assert len(bank) == 3 * 2 * 4 - 1
 
 
+def test_known_focal_lengths_are_not_calibrated_and_each_mapper_has_its_turn_first() -> None:
+    bank = candidate_bank(seed=0, on_trial=None, calibrate=False)
+    assert len(bank) == 3 * 4 - 1
+    assert [candidate.mapper for candidate in bank[:3]] == [
+        MapperKind.GLOBAL, MapperKind.RELAXED, MapperKind.HELD,
+    ]  # fmt: skip
+
+
 def test_held_intrinsics_leave_only_candidates_that_do_not_change_them() -> None:
-    bank = candidate_bank(seed=0, on_trial=StartingCameras.SEPARATE, refinement=Refinement(intrinsics=False))
+    bank = candidate_bank(
+        seed=0,
+        on_trial=StartingCameras.SEPARATE,
+        calibrate=True,
+        refinement=Refinement(intrinsics=False),
+    )
     assert {candidate.cameras for candidate in bank} == {StartingCameras.AS_IS}
     assert {candidate.mapper for candidate in bank} == set(MapperKind) - {MapperKind.HELD}
 
@@ -102,6 +116,7 @@ def test_photos_of_a_shared_camera_get_one_each_and_share_one_again(
     path = tmp_path / "database.db"
     truth = synthesize(path)
     assert find_cameras_on_trial(path) is StartingCameras.SEPARATE
+    assert has_unknown_focal_lengths(path)
     separate = map_candidate(
         Candidate(mapper=mapper, cameras=StartingCameras.SEPARATE), path, tmp_path / "separate"
     )
@@ -131,6 +146,7 @@ def synthesize_with_known_focal_length(folder: Path) -> Path:
 def test_cameras_of_known_focal_length_are_not_on_trial(tmp_path: Path) -> None:
     path = synthesize_with_known_focal_length(tmp_path)
     assert find_cameras_on_trial(path) is None
+    assert not has_unknown_focal_lengths(path)
     for to in (StartingCameras.SEPARATE, StartingCameras.SHARED):
         change_cameras(path, to)
         with pycolmap.Database.open(path) as database:

@@ -21,7 +21,7 @@ POLICY = ChoicePolicy(round_size=2, min_models=3)
 
 def tried(name: str, views: dict[str, View], seconds: float = 1.0) -> Tried:
     explained = explain(views, SCENE.keypoints, SCENE.verified())
-    return Tried(name=name, views=views, explained=explained, seconds=seconds)
+    return Tried(name=name, way=name, views=views, explained=explained, seconds=seconds)
 
 
 def count(views: dict[str, View]) -> int:
@@ -126,6 +126,14 @@ def test_a_wrong_model_found_twice_is_not_confirmed() -> None:
     choice = choose(tried("a", BENT), bank)
     assert choice.chosen.name == "e"
     assert choice.reason == "all candidates have been tried"
+
+
+def test_another_seed_of_the_same_mapper_confirms_nothing() -> None:
+    bank = [tried("c", RIGHT), tried("b", BENT_OTHERWISE), dataclasses.replace(tried("e", RIGHT), way="c")]
+    choice = choose(tried("a", BENT), bank)
+    assert choice.chosen.name == "c"
+    assert choice.reason == "all candidates have been tried"
+    assert choice.support == 0.0
 
 
 def test_bent_models_that_differ_do_not_confirm_each_other() -> None:
