@@ -17,11 +17,12 @@ from corrsfm.colmap.models import write_model
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import atomic_path, atomic_write_json, read_json
 from corrsfm.machine import count_threads
-from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is
+from corrsfm.reconstruction.best_model import judge_as_it_is
 from corrsfm.reconstruction.calibration import Refinement, adjustment_options, restore_priors
 from corrsfm.reconstruction.growth import grow
 from corrsfm.reconstruction.record import record_of
 from corrsfm.reconstruction.resection import Resection
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.stage import fingerprint_of
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_added, read_index

@@ -5,14 +5,12 @@ from __future__ import annotations
 import dataclasses
 import shutil
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
@@ -31,8 +29,7 @@ from corrsfm.reconstruction.candidates import (
     map_candidate,
 )
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
-from corrsfm.reconstruction.epipolar import TwoViews
-from corrsfm.reconstruction.explained import Explained, explain, is_explained
+from corrsfm.reconstruction.explained import explain
 from corrsfm.reconstruction.focal_slack import measure_focal_slack
 from corrsfm.reconstruction.folds.evidence import FoldEvidence
 from corrsfm.reconstruction.folds.unfold import (
@@ -44,82 +41,19 @@ from corrsfm.reconstruction.folds.unfold import (
 )
 from corrsfm.reconstruction.lens import measure_lens_misfit
 from corrsfm.reconstruction.pool import CandidatePool
-from corrsfm.reconstruction.predicted import NeighbourTables, predict, sample_pairs
 from corrsfm.reconstruction.registration import register_again
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
-from corrsfm.reconstruction.views import Views, rays_of, views_of
-from corrsfm.types import Features, Pair
+from corrsfm.reconstruction.views import views_of
+from corrsfm.types import Pair
 
-__all__ = ["SceneEvidence", "Selection", "judge_as_it_is", "policy_for", "select_model"]
+__all__ = ["Selection", "judge_as_it_is", "policy_for", "select_model"]
 
 FIRST = "first"
 _MENDED = "+mended"
 # A large scene must not take 25 times as long; a small one is not bounded by time, on which its model would
 # depend.
 _TIMES, _SECONDS = 2.0, 120.0
-
-
-class SceneEvidence:
-    """What models of one scene are judged by: its verified matches and its features.
-
-    Parameters
-    ----------
-    names : sequence of str
-        All photos of the scene.
-    verified : mapping of Pair to (K, 2) int
-        Verified matches.
-    load : callable
-        Photo name → `Features`.
-    seed : int
-        Of the sample of pairs over which predicted matches of large scenes are counted.
-    """
-
-    def __init__(
-        self,
-        names: Sequence[str],
-        verified: Mapping[Pair, NDArray[np.int32]],
-        load: Callable[[str], Features],
-        *,
-        seed: int = 0,
-    ) -> None:
-        self.names = sorted(names)
-        self.verified = verified
-        self._load = load
-        self._seed = seed
-        self._tables = NeighbourTables(lambda name: load(name).descriptors)
-
-    @cached_property
-    def keypoints(self) -> dict[str, NDArray[np.float32]]:
-        """Keypoints of every photo that is in a verified pair."""
-        paired = sorted({name for pair in self.verified for name in pair})
-        return {name: self._load(name).keypoints for name in paired}
-
-    @cached_property
-    def _pairs(self) -> list[Pair]:
-        return sample_pairs(self.keypoints, self.verified, seed=self._seed)
-
-    def explain(self, views: Views) -> Explained:
-        """What a model explains of the verified matches."""
-        return explain(views, self.keypoints, self.verified)
-
-    def explained_matches(self, views: Views, pair: Pair) -> NDArray[np.bool_]:
-        """Which verified matches of a pair of registered photos a model explains; (K,) bool."""
-        name0, name1 = pair
-        rays = rays_of({name: views[name] for name in pair}, self.keypoints)
-        two = TwoViews(views[name0], views[name1], rays[name0], rays[name1])
-        return is_explained(two, self.verified[pair])
-
-    def count_predicted(self, views: Views) -> int:
-        """Matches that a model predicts; the neighbours of features are computed when first needed."""
-        return sum(len(matches) for matches in self.predicted(views).values())
-
-    def predicted(self, views: Views) -> dict[Pair, NDArray[np.int32]]:
-        """The same matches, (K, 2) keypoint indices for each pair of registered photos that is counted."""
-        return predict(views, self.keypoints, self._tables, self._pairs)
-
-    def features(self, photo: str) -> Features:
-        """Keypoints and descriptors of a photo."""
-        return self._load(photo)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -19,7 +19,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.colmap.log import colmap_log
-from corrsfm.reconstruction.best_model import SceneEvidence
 from corrsfm.reconstruction.cache import load_cache
 from corrsfm.reconstruction.calibration import (
     DEFAULT_REFINEMENT,
@@ -31,6 +30,7 @@ from corrsfm.reconstruction.calibration import (
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.resection import Landmarks
 from corrsfm.reconstruction.same_points import candidates_of, observed, registered_images
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.similarity import Similarity, find_similarity
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair

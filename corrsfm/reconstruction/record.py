@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from corrsfm.reconstruction.best_model import SceneEvidence, Selection
+from corrsfm.reconstruction.best_model import Selection
 from corrsfm.reconstruction.candidates import StartingCameras
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.explained import ExplainedPair
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 
 __all__ = ["FORMAT_VERSION", "record_of"]
 

@@ -24,13 +24,14 @@ from corrsfm.files import atomic_write_json, remove
 from corrsfm.graph import connected_components
 from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
-from corrsfm.reconstruction.best_model import SceneEvidence, judge_as_it_is, policy_for, select_model
+from corrsfm.reconstruction.best_model import judge_as_it_is, policy_for, select_model
 from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mapper import reconstruct as map_database
 from corrsfm.reconstruction.mapper import threads_for
 from corrsfm.reconstruction.record import record_of
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.types import Features
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import Index, read_added, read_index

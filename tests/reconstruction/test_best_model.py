@@ -13,7 +13,7 @@ from synthetic_database import synthesize
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.reconstruction import best_model
 from corrsfm.reconstruction.agreement import agreement
-from corrsfm.reconstruction.best_model import SceneEvidence, Selection, policy_for, select_model
+from corrsfm.reconstruction.best_model import Selection, policy_for, select_model
 from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.candidates import (
     Candidate,
@@ -24,6 +24,7 @@ from corrsfm.reconstruction.candidates import (
 )
 from corrsfm.reconstruction.choice import Tried
 from corrsfm.reconstruction.record import record_of
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.verdict import Grade
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Features

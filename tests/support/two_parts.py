@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from corrsfm.descriptors import unit_rows
-from corrsfm.reconstruction.best_model import SceneEvidence
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.types import Features, Pair
 
 WIDTH, HEIGHT, FOCAL_PX = 1000, 800, 900.0

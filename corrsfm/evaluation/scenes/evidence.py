@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from corrsfm.colmap.pairs import read_verified_matches
 from corrsfm.files import read_json
-from corrsfm.reconstruction.best_model import SceneEvidence
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.views import Views
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.lists import read_index

@@ -30,7 +30,7 @@ from corrsfm.evaluation.scenes.score import (
 from corrsfm.evaluation.scenes.sharing import KEPT_MATCHES, PUTATIVE_MATCHES, share_stages
 from corrsfm.geometry import Pose
 from corrsfm.prune import depends_on_seed
-from corrsfm.reconstruction.best_model import SceneEvidence
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.views import views_of
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.last_run import seed_of_last_run
