@@ -291,11 +291,9 @@ class PruneConfig:
     max_error_px: float = option(
         4.0, "Inlier threshold of the robust estimators", unit="px", above=0, used_with=_ESTIMATOR
     )
-    # Mutual matches beyond the thousand of best ratio cost a quarter of the network's time and bring no pose.
-    max_candidates: int | None = option(
-        None,
-        "Matches per pair that the network sees, of the kind that it reads, best ratio first; if not given "
-        "1000 for a network that reads mutual matches, 2000 for one that reads all",
+    max_candidates: int = option(
+        2000,
+        "Matches per pair that the network sees, of the kind that it reads, best ratio first",
         minimum=16,
         used_with=_NETWORK,
     )

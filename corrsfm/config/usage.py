@@ -75,7 +75,7 @@ class NetworkUsage:
     )
     min_confident_share: float = option(
         0.0,
-        "A pair is doubtful, too, if they are a smaller share of the matches of the kind that it reads",
+        "A pair is doubtful, too, if they are a smaller share of the matches that the network read",
         minimum=0,
         maximum=1,
     )

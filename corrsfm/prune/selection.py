@@ -10,14 +10,7 @@ from corrsfm.errors import InputError
 from corrsfm.geometry import INLIER_THRESHOLD
 from corrsfm.types import Correspondences
 
-__all__ = ["MAX_CANDIDATES", "readable_matches", "score_matches", "select_candidates", "select_kept"]
-
-MAX_CANDIDATES = {MatchInput.ALL: 2000, MatchInput.MUTUAL: 1000}
-"""Matches of a pair that a network sees if nobody says otherwise.
-
-The paper's networks see 2,000 nearest neighbours. Of those of 4,096 keypoints some 1,500 are mutual, and the
-last 500 by ratio hold next to no right one.
-"""
+__all__ = ["readable_matches", "score_matches", "select_candidates", "select_kept"]
 
 _PROBABLE = 0.5
 
@@ -106,7 +99,7 @@ def select_kept(
     scores: NDArray[np.float32],
     operating_point: OperatingPoint,
     usage: NetworkUsage,
-    num_readable: int,
+    num_candidates: int,
 ) -> NDArray[np.bool_]:
     """The matches to keep at an operating point.
 
@@ -126,8 +119,8 @@ def select_kept(
         from overlapping photos and find structure everywhere: of 114 pairs of a validation scene that share
         nothing, 110 passed COLMAP's verification without this.)
     usage : NetworkUsage
-    num_readable : int
-        Matches of the kind that the network reads.
+    num_candidates : int
+        Matches that the network saw.
 
     Returns
     -------
@@ -136,7 +129,7 @@ def select_kept(
     if operating_point is OperatingPoint.POSE:
         return scores > usage.pose_min_score
     confident = pair.mutual & (scores > usage.confident_score)
-    needed = max(usage.min_num_confident, usage.min_confident_share * num_readable)
+    needed = max(usage.min_num_confident, usage.min_confident_share * num_candidates)
     if np.count_nonzero(confident) < needed:
         return confident
     return pair.mutual & (scores > usage.sfm_min_score)

@@ -12,7 +12,7 @@ from corrsfm.config import MatchInput, NetworkUsage, OperatingPoint, Precision, 
 from corrsfm.errors import CheckpointError, CorrsfmError, InputError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.model.rivals import RivalConfig, build_rival
-from corrsfm.prune import Pruner, build_pruner, learned
+from corrsfm.prune import Pruner, build_pruner
 from corrsfm.prune.learned import choose_precision, pack_batches
 from corrsfm.prune.selection import select_candidates
 
@@ -178,19 +178,6 @@ def test_a_network_of_mutual_matches_is_fed_nothing_else(network, mutual_network
     # Candidates are counted among the mutual ones; those left over are judged by the matrix.
     (bounded,) = pruner_of(mutual_network, max_candidates=len(mutual) - 1)([pair])
     assert not bounded.scores[~pair.mutual].any()
-
-
-def test_a_network_of_mutual_matches_sees_a_thousand_and_one_of_all_the_papers_two(network, mutual_network):
-    assert "max_candidates=1000 " in pruner_of(mutual_network).fingerprint
-    assert "max_candidates=2000 " in pruner_of(network).fingerprint
-
-
-def test_what_share_is_confident_does_not_hang_on_how_many_the_network_saw(mutual_network, monkeypatch):
-    counts = []
-    monkeypatch.setattr(learned, "select_kept", lambda *given: counts.append(given[4]) or given[1] > 2)
-    pair = make(num=300)
-    pruner_of(mutual_network, max_candidates=40)([pair])
-    assert counts == [np.count_nonzero(pair.mutual)]
 
 
 def test_a_pair_without_mutual_matches_keeps_nothing(mutual_network):

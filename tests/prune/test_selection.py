@@ -57,8 +57,8 @@ def test_operating_points_keep_what_they_promise():
     assert np.flatnonzero(sfm).tolist() == list(range(0, 80, 2))
     # Twenty confident ones are enough of 100 candidates and too few of 1,000 for a share of 4 %.
     shared = NetworkUsage(min_confident_share=0.04)
-    for num_readable, last in ((100, 80), (500, 80), (1000, 40)):
-        sfm = select_kept(pair, scores, OperatingPoint.SFM, shared, num_readable)
+    for num_candidates, last in ((100, 80), (500, 80), (1000, 40)):
+        sfm = select_kept(pair, scores, OperatingPoint.SFM, shared, num_candidates)
         assert np.flatnonzero(sfm).tolist() == list(range(0, last, 2))
     # One confident mutual match less: the pair is doubtful, and only the confident ones stay.
     scores[0] = 0.69

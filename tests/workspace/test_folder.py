@@ -95,7 +95,7 @@ def test_the_command_to_run_has_the_recorded_options_quoted_for_the_shell(tmp_pa
 @pytest.mark.parametrize("stage", STAGE_COMMANDS)
 def test_the_command_to_run_is_understood_by_the_command_line(workspace: Workspace, stage: str) -> None:
     others: dict[type, object] = {bool: True, int: 99, float: 0.5, str: "f,x,y"}
-    not_given = {"max_ratio": 0.7, "max_candidates": 99}  # where None stands for a number, and not for a path
+    not_given = {"max_ratio": 0.7}  # where None stands for a number, and not for a path
     num_flags = 0
     for name, options in (
         ("images", cfg.ImagesConfig), ("features", cfg.FeaturesConfig), ("pairs", cfg.PairsConfig),
