@@ -17,6 +17,7 @@ from corrsfm.finished.incoming import Incoming
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.models import models_of
 
 __all__ = [
     "Pending",
@@ -54,7 +55,8 @@ def pending_addition(workspace: Workspace) -> Pending:
     Raises
     ------
     WorkspaceError
-        If nothing was interrupted and the scene has no current model, or its database was damaged since.
+        If nothing was interrupted and the scene has no current model, or its database or models were damaged
+        since.
     """
     try:
         pending = Pending(**read_json(workspace.adding))
@@ -64,6 +66,7 @@ def pending_addition(workspace: Workspace) -> Pending:
             raise TypeError(f"lacks the options of {min(missing)}")
     except FileNotFoundError:
         workspace.require("models")
+        models_of(workspace)
         # Photos are put into what is there, and cannot mend it; mapped again it would not be the same model.
         if changed := workspace.changed_files("verified matches"):
             raise WorkspaceError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING
 from corrsfm.colmap.models import read_models
 from corrsfm.errors import WorkspaceError, first_few
 from corrsfm.files import atomic_path, sha256_of
+from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index
 
@@ -91,10 +93,9 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
     """
     for folder in changed_models(workspace, changed):
         if not _can_be_read(folder):
-            remedy = workspace.command_for("models", "--overwrite")
             raise WorkspaceError(
                 f"{folder}: damaged, not as it was written"
-                f"{what_mapping_again_moves(workspace)}; make it again with: {remedy}"
+                f"{what_mapping_again_moves(workspace)}; make it again with: {_mapping_again(workspace)}"
             )
         logger.warning(
             "%s: changed since corrsfm wrote it; it is used as it is, without the verdict on the old "
@@ -103,8 +104,17 @@ def models_of(workspace: Workspace, changed: Iterable[Path] | None = None) -> li
             workspace.command_for("models", "--overwrite"),
         )
     models = read_models(workspace.sparse)
-    _require_known_photos(workspace, models)
+    _require_own_photos(workspace, models)
     return models
+
+
+def _mapping_again(workspace: Workspace) -> str:
+    """The commands that map again; an addition that was interrupted needs the models, and is given up."""
+    if not workspace.adding.exists():
+        return workspace.command_for("models", "--overwrite")
+    stages = [*dict.fromkeys(map(workspace.command_for, list(STAGE_COMMANDS)[:-1]))]
+    giving_up = shlex.join(["rm", str(workspace.adding)])
+    return "; ".join([giving_up, *stages, workspace.command_for("models", "--overwrite")])
 
 
 def others_in_models(workspace: Workspace) -> list[Path]:
@@ -145,15 +155,23 @@ def _contents(folder: Path) -> dict[Path, str]:
     return {path.relative_to(folder): sha256_of(path) for path in folder.rglob("*") if path.is_file()}
 
 
-def _require_known_photos(workspace: Workspace, models: Iterable[pycolmap.Reconstruction]) -> None:
-    """Refuse models of photos that the scene does not hold: their names may lead anywhere."""
-    known = set(read_index(workspace).names)
-    if strange := sorted({image.name for model in models for image in model.images.values()} - known):
-        remedy = workspace.command_for("models", "--overwrite")
+def _require_own_photos(workspace: Workspace, models: Iterable[pycolmap.Reconstruction]) -> None:
+    """Refuse models of photos that the scene does not hold, whose names lead anywhere, or of other sizes."""
+    index = read_index(workspace)
+    cameras = {record.name: index.camera_of(record) for record in index.records}
+    images = [image for model in models for image in model.images.values()]
+    if strange := sorted({image.name for image in images} - cameras.keys()):
         raise WorkspaceError(
             f"{workspace.sparse}: holds photos that this scene does not: {first_few(strange)}; name them as "
-            f"the scene does, or make the models again with: {remedy}"
+            f"the scene does, or make the models again with: {_mapping_again(workspace)}"
         )
+    for image in images:
+        there, wanted = image.camera, cameras[image.name]
+        if (there.width, there.height) != (wanted.width, wanted.height):
+            raise WorkspaceError(
+                f"{workspace.sparse}: says that {image.name} has {there.width}×{there.height} pixels, not "
+                f"{wanted.width}×{wanted.height}; make the models again with: {_mapping_again(workspace)}"
+            )
 
 
 def _can_be_read(folder: Path) -> bool:

@@ -3,7 +3,9 @@
 import dataclasses
 import json
 import logging
+import os
 import re
+import shlex
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,6 +14,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from click.testing import CliRunner
 from rendered_scene import CONFIG
 from scene_to_grow import SceneToGrow, contents, make_scene_to_grow
 
@@ -19,6 +22,7 @@ import corrsfm.features.stage
 import corrsfm.finished.add as adding
 import corrsfm.finished.grown_models as grown_models
 from corrsfm import config as cfg
+from corrsfm.cli import main
 from corrsfm.colmap.models import poses_of
 from corrsfm.errors import CorrsfmError, ImageError, InputError, WorkspaceError
 from corrsfm.finished.add import add_photos
@@ -318,6 +322,49 @@ def test_a_damaged_note_of_an_addition_is_named(scene: SceneToGrow, content: str
     (scene.workspace / "adding.json").write_text(content)
     with pytest.raises(WorkspaceError, match=r"adding\.json: damaged .* remove it, with: rm "):
         add_photos(scene.workspace, run=RUN)
+
+
+def damage(scene: SceneToGrow, how: str) -> None:
+    path = scene.workspace / "sparse" / "0"
+    if how == "cut off":
+        os.truncate(path / "points3D.bin", 100)
+        return
+    model = pycolmap.Reconstruction(path)
+    if how == "of other photos":
+        next(iter(model.images.values())).name = "stranger.png"
+    else:
+        next(iter(model.cameras.values())).height += 1
+    model.write(path)
+
+
+@pytest.mark.parametrize("how", ["cut off", "of other photos", "of other sizes"])
+def test_nothing_is_added_to_a_damaged_model(scene: SceneToGrow, how: str) -> None:
+    damage(scene, how)
+    before = contents(scene.photos), contents(scene.workspace)
+    with pytest.raises(WorkspaceError, match=r"corrsfm reconstruct .* --overwrite"):
+        add_photos(scene.workspace, scene.new, run=RUN)
+    assert (contents(scene.photos), contents(scene.workspace)) == before
+
+
+def test_a_model_damaged_during_an_addition_is_made_again_by_the_commands_that_are_named(
+    scene: SceneToGrow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(adding, "match_pairs", interrupt)
+        add_photos(scene.workspace, scene.new, run=RUN)
+    damage(scene, "cut off")
+    with pytest.raises(WorkspaceError, match="damaged") as told:
+        add_photos(scene.workspace, run=RUN)
+    for command in str(told.value).partition("again with: ")[2].split("; "):
+        words = shlex.split(command)
+        if words[0] == "rm":
+            Path(words[1]).unlink()
+        else:
+            assert CliRunner().invoke(main, [*words[1:], "--threads", "1"]).exit_code == 0, command
+    assert len(scene.model().images) == 7
 
 
 def test_photos_in_the_folder_of_the_scene_are_used_where_they_are(scene: SceneToGrow) -> None:
