@@ -13,7 +13,7 @@ import click
 
 from corrsfm.cli.finished import show_workspace
 from corrsfm.cli.options import PATH, echo_json, json_option
-from corrsfm.errors import CorrsfmError, first_few
+from corrsfm.errors import CorrsfmError, InputError, first_few
 
 __all__ = ["check"]
 
@@ -67,9 +67,13 @@ def check(
     """
     from corrsfm.workspace.manifest import has_lost_manifest
 
-    if len(photos) == 1 and (os.path.lexists(photos[0] / "workspace.json") or has_lost_manifest(photos[0])):
-        show_workspace(photos[0], as_json, integrity)
-        return
+    for path in photos:
+        if os.path.lexists(path / "workspace.json") or has_lost_manifest(path):
+            if len(photos) > 1:
+                command = shlex.join(["corrsfm", "check", str(path)])
+                raise InputError(f"{path}: is a workspace; look at it alone, with: {command}")
+            show_workspace(path, as_json, integrity)
+            return
     from corrsfm.config import PipelineConfig, RunConfig
     from corrsfm.files import atomic_write_text
     from corrsfm.images.check import check_photos

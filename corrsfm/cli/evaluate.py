@@ -204,7 +204,8 @@ def _score_lines(score: dict[str, Any]) -> Iterator[str]:
     for threshold, value in score["auc"].items():
         yield f"pose AUC@{threshold + '°':<11}{value:.1f} %"
     if score["position_error_mean"] is None:
-        yield "position error      undetermined: fewer than 3 registered photos, or all on a line"
+        why = "fewer than 3 registered photos, or all on a line or in one place"
+        yield f"position error      undetermined: {why}"
         return
     percent = score["position_error_percent"]
     share = "" if percent is None else f" (mean {percent:.2f} % of its extent)"

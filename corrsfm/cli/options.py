@@ -63,7 +63,8 @@ class _PathType(click.Path):
         if why := why_unusable(text):
             shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
             self.fail(f"'{printable(shown)}' {why}" if text else why, param, ctx)
-        return super().convert(value, param, ctx)
+        # Commands that are advised to paste would take such a name for an option.
+        return super().convert(os.path.abspath(text) if text.startswith("-") else value, param, ctx)
 
 
 PATH = _PathType(path_type=Path)

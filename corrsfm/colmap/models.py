@@ -79,7 +79,9 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
     except _UNREADABLE as error:
         # pycolmap says first where in its source it was.
         what = re.sub(r"^\[[\w.]+:\d+\] ", "", str(error))
-        raise InputError(f"{folder}: COLMAP model cannot be read ({what})") from error
+        raise InputError(
+            f"{folder}: COLMAP model cannot be read ({what}); a file of it is damaged: give a whole one"
+        ) from error
 
 
 def _read(folder: Path) -> pycolmap.Reconstruction:

@@ -23,6 +23,7 @@ __all__ = [
     "align_similarity",
     "auc_contributions",
     "bootstrap_mean",
+    "extent_of",
     "homography_corner_error",
     "paired_bootstrap",
     "pose_auc",
@@ -237,6 +238,14 @@ def position_errors(positions: ArrayLike, truth: ArrayLike) -> NDArray[np.float6
     return np.linalg.norm(aligned - np.asarray(truth, np.float64), axis=1)
 
 
+def extent_of(centres: NDArray[np.float64]) -> float:
+    """Diagonal of the box around camera centres (n, 3); 0 if they differ by rounding only, or without any."""
+    if not len(centres):
+        return 0.0
+    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    return extent if extent > 1e-9 * np.abs(centres).max() else 0.0
+
+
 def relative_pose_errors(
     poses: Mapping[str, Pose], truth: Mapping[str, Pose], pairs: Sequence[tuple[str, str]] | None = None
 ) -> NDArray[np.float64]:
@@ -262,7 +271,7 @@ def relative_pose_errors(
     if pairs is None:
         pairs = [(first, second) for i, first in enumerate(names) for second in names[i + 1 :]]
     centres = np.array([camera_centre(pose) for pose in truth.values()])
-    extent = float(np.linalg.norm(np.ptp(centres, axis=0))) if len(centres) else 0.0
+    extent = extent_of(centres)
     errors = np.full(len(pairs), np.inf)
     for index, (first, second) in enumerate(pairs):
         if first not in poses or second not in poses:
@@ -270,7 +279,7 @@ def relative_pose_errors(
         rotation, translation = relative_pose(*poses[first], *poses[second])
         true_rotation, true_translation = relative_pose(*truth[first], *truth[second])
         error = rotation_angle_deg(rotation @ true_rotation.T)
-        if np.linalg.norm(true_translation) > 1e-6 * extent:
+        if extent and np.linalg.norm(true_translation) > 1e-6 * extent:
             error = max(error, angle_between_deg(translation, true_translation))
         errors[index] = error
     return errors

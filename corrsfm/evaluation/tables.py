@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ from typing import Any
 
 from corrsfm.errors import InputError
 
-__all__ = ["Table", "build_table", "grades_text", "median_and_worst", "render_table"]
+__all__ = ["Table", "build_table", "grades_text", "median_and_worst", "percent_of", "render_table"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,12 +176,17 @@ def _compare_seeds_table(values: dict[str, Any], num_seeds: int) -> Table:
     return Table(header=header, rows=rows, caption=caption)
 
 
+def percent_of(share: float) -> float:
+    """A share in percent, rounded down to a tenth as in verdicts: 99.97 % is not everything."""
+    return math.floor(1000.0 * share) / 10.0
+
+
 def _seed_cells(seed: dict[str, Any]) -> list[str]:
     """Photos, points, explained share, predicted matches and verdict on one model."""
     return [
         str(seed["num_registered"]),
         str(seed["num_points"]),
-        _number(100.0 * seed["explained_share"]),
+        _number(percent_of(seed["explained_share"])),
         str(seed["num_predicted_matches"]),
         grades_text([seed]).removeprefix("1 "),
     ]
@@ -199,7 +205,7 @@ def _scene_table(values: dict[str, Any]) -> Table:
             name,
             _number(summary["num_registered"], 0),
             _number(summary["num_points"], 0),
-            _number(100.0 * summary["explained_share"]),
+            _number(percent_of(summary["explained_share"])),
             _number(summary["num_predicted_matches"], 0),
             *(_number(value) for value in summary["auc"].values()),
         ]

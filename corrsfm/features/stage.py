@@ -27,6 +27,7 @@ from corrsfm.workspace.imported import (
     imported_features,
     imported_from,
     traits_to_come,
+    warn_of_no_effect,
 )
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import StageOutcome, complete, finished_or_mended, mark_left_out
@@ -62,6 +63,7 @@ def extract_features(
     store = features_of(workspace)
     if (source := imported_from(workspace, "features")) is not None:
         traits_to_come(workspace, config, cfg.MatchesConfig())
+        warn_of_no_effect("features", config, overwrite=overwrite)
         if run.verify:
             store.require_whole()
         return complete(

@@ -12,7 +12,7 @@ from corrsfm.workspace.imported import imported_from
 __all__ = ["command_again", "more_photos_to_add", "more_photos_to_map", "next_step"]
 
 
-def command_again(workspace: Workspace, stage: str, *flags: str) -> str:
+def command_again(workspace: Workspace, stage: str, *flags: str, images_dir: str | None = None) -> str:
     """The commands that make a stage with further options, and all stages that hang on it.
 
     Every other option stays what it was.
@@ -23,10 +23,12 @@ def command_again(workspace: Workspace, stage: str, *flags: str) -> str:
     stage : str
     flags : str
         Words to add to the first command.
+    images_dir : str, optional
+        As for `Workspace.command_for`.
     """
     stages = list(STAGE_COMMANDS)
     first, *others = dict.fromkeys(workspace.command_for(one) for one in stages[stages.index(stage) :])
-    return "; ".join([workspace.command_for(stage, *flags), *others])
+    return "; ".join([workspace.command_for(stage, *flags, images_dir=images_dir), *others])
 
 
 def next_step(missing: MissingPhoto, workspace: Workspace) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from corrsfm.report.statistics import SceneReport
 from corrsfm.types import PairStatistics
 from corrsfm.workspace import Workspace
 from corrsfm.workspace.last_run import seed_of_last_run
-from corrsfm.workspace.lists import read_index
+from corrsfm.workspace.lists import read_added, read_index
 
 __all__ = ["Bridge", "HeldPhoto", "SceneFinding", "WorkspaceCheck", "check_workspace"]
 
@@ -220,15 +221,21 @@ def _photos(scene: Workspace) -> list[SceneFinding]:
     """Photos that are no longer what was reconstructed; all that other tools get of the scene needs them."""
     records = read_index(scene).records
     missing, changed = photos_unlike(records, scene.images_dir, PhotoCache(scene.photo_cache))
-    again = command_again(scene, "images")
-    found = []
+    found, source = [], None
+    # Frames and converted photos are made again, but photos that were added lie among them alone.
+    are_ours = scene.images_dir in (scene.frames, scene.converted)
+    if are_ours and read_added(scene):
+        source, are_ours = str(scene.images_dir), False
+    elif are_ours and not all(map(os.path.exists, scene.given_photos)):
+        source = "VIDEO" if scene.is_sequence else "PHOTOS"
+    again = command_again(scene, "images", images_dir=source)
     if len(missing) == len(records):
         moved = scene.command_for("images", images_dir="NEWDIR")
         text, step = f"the photos are no longer in {scene.images_dir}", f"put them back, or run: {moved}"
         found.append(SceneFinding(kind="photos", text=text, photos=(), next_step=step))
     elif missing:
         text = f"photos that are no longer in {scene.images_dir}, or cannot be read: {first_few(missing)}"
-        step = f"put them back, or leave them out, with: {again}"
+        step = f"put them back, or {'make them again' if are_ours else 'leave them out'}, with: {again}"
         found.append(SceneFinding(kind="photos", text=text, photos=tuple(missing), next_step=step))
     if changed:
         text = f"photos that have changed since they were reconstructed: {first_few(changed)}"

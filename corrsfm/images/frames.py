@@ -21,7 +21,7 @@ from corrsfm.errors import InputError, WorkspaceError, first_few
 from corrsfm.files import FRAME_TIMES, OWN_RECORD, atomic_path, atomic_write_json, read_json, sha256_of
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 
-__all__ = ["Frame", "extract_frames"]
+__all__ = ["Frame", "are_frames_of", "extract_frames"]
 
 logger = logging.getLogger("corrsfm")
 
@@ -180,6 +180,14 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
     }
     atomic_write_json(path, {"key": key, **plain})
     return measured
+
+
+def are_frames_of(video: Path, folder: Path, *, hash_of: Callable[[Path], str] = sha256_of) -> bool:
+    """Whether the frames in a folder are those of a video, wherever that was when they were taken."""
+    try:
+        return read_json(folder / OWN_RECORD)["key"] == {"version": _VERSION, "sha256": hash_of(video)}
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _frames_in(folder: Path) -> set[str]:

@@ -18,7 +18,7 @@ from corrsfm.errors import ConfigError, InputError, WorkspaceError, first_few
 from corrsfm.files import OWN_RECORD
 from corrsfm.images.cache import PhotoCache
 from corrsfm.images.convert import is_converted, possible_originals, readable_copies
-from corrsfm.images.frames import extract_frames
+from corrsfm.images.frames import are_frames_of, extract_frames
 from corrsfm.images.index import duplicate_images, index_images, name_remarks
 from corrsfm.images.listing import list_images
 from corrsfm.images.sources import Given, PhotoSource, find_source
@@ -176,8 +176,15 @@ def _refuse_vanished_photos(workspace: Workspace, source: PhotoSource) -> None:
     except WorkspaceError:
         return
     # A workspace that lost its record knows no video; its frames say which they are from.
-    if source.video is not None and workspace.given_photos in ((), source.given):
-        return
+    if source.video is not None:
+        if workspace.given_photos in ((), source.given) or are_frames_of(source.video, workspace.frames):
+            return
+        if workspace.is_sequence:
+            raise InputError(
+                f"{source.video}: another video than {first_few(workspace.given_photos)}, which "
+                f"{workspace.root} was made of; choose another workspace, or add --overwrite to do all of it "
+                "again with this one"
+            )
     gone = [name for name in known if not any(map(os.path.exists, possible_originals(source.folder / name)))]
     if 2 * len(gone) > len(known):
         raise InputError(

@@ -29,6 +29,7 @@ from corrsfm.workspace.imported import (
     record_imported_pairs,
 )
 from corrsfm.workspace.items import FEATURES, MATCHES, Arrays
+from corrsfm.workspace.layout import Layout
 from corrsfm.workspace.lists import Index, read_index
 from corrsfm.workspace.resume import complete
 from corrsfm.workspace.stores import features_of, matches_of
@@ -132,6 +133,11 @@ def import_features(
         database=_absolute(database),
         kind=cfg.FeatureKind(kind),
     )
+    if files.database is not None and files.database.resolve() == Layout(folder).database.resolve():
+        raise InputError(
+            f"{database}: the workspace {folder} writes its own database there; copy this one to another "
+            "place, or choose another folder for the workspace"
+        )
     opened: contextlib.AbstractContextManager[Source]
     if files.features is not None:
         opened = open_hloc(files.features, files.matches)

@@ -11,7 +11,13 @@ from corrsfm.machine import count_threads, find_device, threaded, use_threads
 from corrsfm.matches import create_matcher
 from corrsfm.types import Matches, Pair
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.imported import drop_foreign_record, imported_from, imported_matches, traits_with
+from corrsfm.workspace.imported import (
+    drop_foreign_record,
+    imported_from,
+    imported_matches,
+    traits_with,
+    warn_of_no_effect,
+)
 from corrsfm.workspace.resume import StageOutcome, complete, wanted_matches
 from corrsfm.workspace.shards import make_items
 from corrsfm.workspace.stores import features_of, matches_of
@@ -40,6 +46,7 @@ def match_pairs(
     store = matches_of(workspace)
     inputs = {"features": features.fingerprint, "pairs": pairs.fingerprint}
     if (source := imported_from(workspace, "matches")) is not None:
+        warn_of_no_effect("matches", config, overwrite=overwrite)
         if run.verify:
             store.require_whole()
         wanted = imported_matches(workspace)

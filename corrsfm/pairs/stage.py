@@ -13,7 +13,12 @@ from corrsfm.graph import describe_components
 from corrsfm.pairs import strategies
 from corrsfm.types import PairList
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.imported import drop_foreign_record, imported_from, record_imported_pairs
+from corrsfm.workspace.imported import (
+    drop_foreign_record,
+    imported_from,
+    record_imported_pairs,
+    warn_of_no_effect,
+)
 from corrsfm.workspace.lists import Index, read_added, read_index, read_pairs, write_pairs
 from corrsfm.workspace.resume import StageOutcome, explain, finish, photos_left_out
 from corrsfm.workspace.stores import features_of, matches_of
@@ -37,6 +42,7 @@ def make_pairs(
     features = workspace.require("features")
     drop_foreign_record(workspace, "pairs")
     if (source := imported_from(workspace, "pairs")) is not None:
+        warn_of_no_effect("pairs", config, overwrite=overwrite)
         return _keep_imported(workspace, source, index.names)
     fingerprint = fingerprint_of(
         index, features.fingerprint, config, run.seed, is_sequence=workspace.is_sequence

@@ -52,12 +52,16 @@ def _save(figure: Any, output: Path, dpi: int) -> None:
 def plot_learning_curves(run_folder: Path, output: Path) -> None:
     """Draw losses, learning rate and validation scores of a run into a PNG."""
     losses = ("step", "classification", "essential", "learning_rate")
-    log = _read_columns(Path(run_folder) / "log.csv", losses)
+    log_path = Path(run_folder) / "log.csv"
+    was_begun = (Path(run_folder) / "recipe.json").exists()
+    log = _read_columns(log_path, losses) if log_path.exists() or not was_begun else {}
     validation_path = Path(run_folder) / "validation.csv"
     scores = ("step", "auc5", "auc10", "auc20", "baseline_auc5")
     validation = _read_columns(validation_path, scores) if validation_path.exists() else {}
     if not log:
-        raise InputError(f"{run_folder}: its log is empty; train for longer")
+        raise InputError(
+            f"{run_folder}: nothing was logged yet; train for longer, or with a smaller --log-every"
+        )
     figure, axes = _figure(1, 4, 17, 3.6)
     for axis, name, title in zip(
         axes, ("classification", "essential", "learning_rate"),

@@ -8,12 +8,16 @@ lost its manifest, or an import that was killed, is not taken for one that has n
 from __future__ import annotations
 
 import json
+import logging
+import shlex
 from collections.abc import Sequence
 from typing import Any
 
 from corrsfm import config as cfg
+from corrsfm.config.fields import flags_of
 from corrsfm.errors import ConfigError, DamageError, WorkspaceError, first_few
 from corrsfm.types import Pair, PairList
+from corrsfm.workspace.commands import label_of
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index, read_pairs, write_pairs
 from corrsfm.workspace.manifest import StageRecord
@@ -30,7 +34,10 @@ __all__ = [
     "traits_of",
     "traits_to_come",
     "traits_with",
+    "warn_of_no_effect",
 ]
+
+logger = logging.getLogger("corrsfm")
 
 _IMPORTED = "imported"
 
@@ -115,6 +122,17 @@ def imported_features(workspace: Workspace) -> dict[str, str]:
 def imported_matches(workspace: Workspace) -> dict[Pair, str]:
     """Fingerprints of imported matches, which are what they are."""
     return matches_of(workspace).fingerprints(read_pairs(workspace).pairs)
+
+
+def warn_of_no_effect(stage: str, config: Any, *, overwrite: bool) -> None:
+    """Say which options ask in vain for other items than the imported ones."""
+    flags = flags_of(type(config), cfg.to_dict(config, only_result=True))
+    if overwrite:
+        flags.append("--overwrite")
+    if flags:
+        logger.warning(
+            "%s: they were imported and are kept; no effect: %s", label_of(stage), shlex.join(flags)
+        )
 
 
 def record_imported_pairs(

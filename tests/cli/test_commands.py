@@ -1,6 +1,7 @@
 """The command line: every command has help and a home, results on stdout, errors that end with a code."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -93,6 +94,22 @@ def test_prune_writes_the_database(scene: Path) -> None:
     result = invoke("-q", "prune", scene, "--method", "ratio")
     assert result.exit_code == 0, result.output
     assert list((scene / "pruned").iterdir()) and (scene / "database.db").exists()
+
+
+def test_commands_that_are_named_for_a_workspace_with_a_dash_can_be_pasted(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(scene, tmp_path / "-scene")
+    said = invoke("reconstruct", "--", "-scene").stderr
+    assert said.endswith(f"run: corrsfm prune {tmp_path / '-scene'}\n")
+
+
+def test_a_workspace_among_photos_to_check_is_not_passed_over(scene: Path, photos: Path) -> None:
+    for words in ((scene, photos), (photos, scene)):
+        result = invoke("check", *words)
+        assert result.exit_code == 1
+        assert f"{scene}: is a workspace; look at it alone, with: corrsfm check {scene}" in result.stderr
 
 
 def test_underscores_in_flags_are_accepted(scene: Path) -> None:

@@ -16,6 +16,7 @@ from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.cli import main
 from corrsfm.errors import ConfigError, InputError, WorkspaceError
+from corrsfm.finished.check import _photos
 from corrsfm.images.frames import extract_frames
 from corrsfm.images.video import Measured, choose_frames, measure_video, read_frames, seconds_of
 from corrsfm.workspace import Workspace
@@ -310,6 +311,41 @@ def test_the_same_command_does_nothing_twice(workspace: Workspace, walk: Film) -
     assert str(walk.path) in workspace.command_for("images") and "--frames 14" in workspace.command_for(
         "images"
     )
+
+
+def test_a_video_that_was_moved_is_the_same_and_another_one_is_named(
+    workspace: Workspace, walk: Film, tmp_path: Path
+) -> None:
+    copied = Workspace(shutil.copytree(workspace.root, tmp_path / "scene"))
+    frames = {path.name: path.stat().st_mtime_ns for path in copied.frames.glob("*.jpg")}
+    moved = Path(shutil.copy(walk.path, tmp_path / f"moved{walk.path.suffix}"))
+    pipeline.index_photos(copied, moved, cfg.ImagesConfig(frames=14), RUN)
+    assert pipeline.extract_features(copied, cfg.FeaturesConfig(max_features=200), RUN).skipped
+    assert {path.name: path.stat().st_mtime_ns for path in copied.frames.glob("*.jpg")} == frames
+    assert copied.given_photos == (str(moved),)
+    other = write_video(tmp_path / "other.avi", sliding(10))
+    with pytest.raises(InputError, match=rf"other\.avi: another video than {moved}, .* --overwrite"):
+        pipeline.index_photos(copied, other, cfg.ImagesConfig(frames=4), RUN)
+
+
+def test_what_becomes_of_lost_frames_is_said_as_it_is(
+    workspace: Workspace, walk: Film, tmp_path: Path
+) -> None:
+    copied = Workspace(shutil.copytree(workspace.root, tmp_path / "scene"))
+    (copied.frames / read_index(copied).names[0]).unlink()
+    moved = Path(shutil.copy(walk.path, tmp_path / f"moved{walk.path.suffix}"))
+
+    def advice() -> str:
+        (finding,) = _photos(copied)
+        return finding.next_step
+
+    assert advice().startswith(f"put them back, or make them again, with: corrsfm extract {walk.path} ")
+    copied.remember_photos([str(moved)], copied.frames)
+    moved.unlink()
+    assert "make them again, with: corrsfm extract VIDEO " in advice()
+    # Made again from the video, the scene would lose what was added to it.
+    copied.added.write_text('{"photos": {"new.jpg": {"model": 0}}}')
+    assert f"leave them out, with: corrsfm extract {copied.frames} " in advice()
 
 
 def test_overwrite_makes_frames_again(workspace: Workspace, walk: Film, tmp_path: Path) -> None:

@@ -70,6 +70,20 @@ def test_nothing_is_left_beside_a_database(photos: Path, names: list[str], tmp_p
     assert list(path.parent.iterdir()) == [path] and path.read_bytes() == before
 
 
+def test_the_database_that_the_workspace_would_write_is_refused(
+    photos: Path, names: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "scene").mkdir()
+    path = tmp_path / "scene" / "database.db"
+    write_old_database(path, names)
+    before = path.read_bytes()
+    with pytest.raises(InputError, match=r"scene/database\.db: the workspace .* copy this one"):
+        import_features(
+            photos, tmp_path / "scene", database=tmp_path / "scene" / ".." / "scene" / "database.db"
+        )
+    assert path.read_bytes() == before and len(list((tmp_path / "scene").iterdir())) == 1
+
+
 def test_matches_may_be_left(photos: Path, names: list[str], tmp_path: Path) -> None:
     write_old_database(tmp_path / "database.db", names)
     result = import_features(

@@ -127,6 +127,29 @@ def test_matches_come_in_and_are_not_made_again(
             pipeline.prune_matches(workspace, cfg.PruneConfig(method=method), RUN)
 
 
+def test_options_that_ask_for_other_items_than_the_imported_ones_are_named(
+    photos: Path, features: Path, tmp_path: Path, names: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    write_matches(tmp_path / "matches.h5", [(names[0], names[1]), (names[0], names[2])])
+    import_features(photos, tmp_path / "scene", features=features, matches=tmp_path / "matches.h5")
+    workspace = Workspace(tmp_path / "scene")
+    caplog.clear()
+    pipeline.extract_features(workspace, cfg.FeaturesConfig(), RUN)
+    pipeline.make_pairs(workspace, cfg.PairsConfig(), RUN)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(block_size=128), RUN)
+    assert "no effect" not in caplog.text
+    pipeline.extract_features(workspace, cfg.FeaturesConfig(max_features=77), RUN)
+    pipeline.make_pairs(workspace, cfg.PairsConfig(sequential_overlap=1), RUN)
+    pipeline.match_pairs(workspace, cfg.MatchesConfig(), RUN, overwrite=True)
+    kept = "they were imported and are kept; no effect:"
+    for told in (
+        f"features: {kept} --max-features 77",
+        f"pairs: {kept} --sequential-overlap 1",
+        f"matches: {kept} --overwrite",
+    ):
+        assert told in caplog.text
+
+
 def test_what_was_imported_of_photos_that_are_left_out_waits_for_their_return(
     photos: Path, features: Path, tmp_path: Path, names: list[str]
 ) -> None:

@@ -28,6 +28,12 @@ def test_a_run_without_a_log_is_refused(tmp_path):
         plot_learning_curves(tmp_path, tmp_path / "curves.png")
 
 
+def test_a_run_that_logged_nothing_yet_says_so(tmp_path):
+    (tmp_path / "recipe.json").write_text("{}")
+    with pytest.raises(InputError, match="nothing was logged yet; .*--log-every"):
+        plot_learning_curves(tmp_path, tmp_path / "out.png")
+
+
 def test_page_of_real_and_synthetic_pairs(tmp_path):
     write_scenes(tmp_path / "pairs.h5", [make_scene()])
     real, synthetic = draw_both([tmp_path / "pairs.h5"], 2, num_pairs=4, num_matches=50)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from corrsfm.evaluation.tables import grades_text, median_and_worst
+from corrsfm.evaluation.tables import grades_text, median_and_worst, percent_of
 from corrsfm.files import atomic_write_text
 from corrsfm.report.pictures import draw_matches, jpeg_uri, read_photo
 from corrsfm.report.style import frame, section
@@ -40,7 +40,7 @@ _COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
     ("map s", lambda m: m["seconds"]["map"], 1, -1),
 )
 _ONE_SEED_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
-    ("explained %", lambda m: 100.0 * m["seeds"][0]["explained_share"], 1, 1),
+    ("explained %", lambda m: percent_of(m["seeds"][0]["explained_share"]), 1, 1),
     ("predicted", lambda m: m["seeds"][0]["num_predicted_matches"], 0, 1),
 )
 _TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], int, int], ...] = (
@@ -53,7 +53,7 @@ _SEED_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], str], ...] = (
     # heading, value of one seed, a median or a worst, and its format; more is better
     ("photos", lambda s: s["num_registered"], ",g"),
     ("points", lambda s: s["num_points"], ",.0f"),
-    ("explained %", lambda s: 100.0 * s["explained_share"], ".1f"),
+    ("explained %", lambda s: percent_of(s["explained_share"]), ".1f"),
     ("predicted", lambda s: s["num_predicted_matches"], ",.0f"),
 )
 _SEED_TRUTH_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], Any], str], ...] = (

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from corrsfm.errors import InputError, lack_or_text
-from corrsfm.evaluation.metrics import pose_auc, position_errors, relative_pose_errors
+from corrsfm.evaluation.metrics import extent_of, pose_auc, position_errors, relative_pose_errors
 from corrsfm.files import read_json
 from corrsfm.geometry import Pose, camera_centre
 from corrsfm.workspace import Workspace
@@ -189,10 +189,11 @@ def score_poses(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> SceneSc
     names = [name for name in sorted(truth) if name in poses]
     errors = relative_pose_errors(poses, truth)
     centres = np.array([camera_centre(truth[name]) for name in sorted(truth)])
-    extent = float(np.linalg.norm(np.ptp(centres, axis=0)))
+    extent = extent_of(centres)
     finite = errors[np.isfinite(errors)]
     distances = None
-    if len(names) >= 3:
+    # Where all stand in one place, any model shrunk to a point would fit.
+    if len(names) >= 3 and extent:
         try:
             distances = position_errors(
                 [camera_centre(poses[name]) for name in names], [camera_centre(truth[name]) for name in names]

@@ -4,7 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
-import cv2  # noqa: F401  (before pycolmap)
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -139,6 +139,15 @@ def test_known_cameras_of_one_place_have_no_share_of_an_extent() -> None:
         "position_error_median": 0.1, "position_error_max": 0.2, "position_error_percent": None,
     }  # fmt: skip
     assert list(_score_lines(values))[-1].endswith("in units of the ground truth")
+
+
+def test_nothing_is_said_of_positions_where_all_known_cameras_stand_in_one_place() -> None:
+    turns = [cv2.Rodrigues(np.array([0.0, 0.1 * number, 0.0]))[0] for number in range(4)]
+    place = np.array([5.0, 5.0, 5.0])
+    truth = {str(number): (turn, -turn @ place) for number, turn in enumerate(turns)}
+    poses = {name: (turn, np.array([0.0, float(name), 1.0])) for name, (turn, _) in truth.items()}
+    score = score_poses(poses, truth)
+    assert score.position_error_max is None and score.auc["5"] == pytest.approx(100.0)
 
 
 def test_command_prints_the_score(truth_dir: Path, tmp_path: Path):
