@@ -128,7 +128,7 @@ REGISTRY: dict[str, BundledCheckpoint] = {
         BundledCheckpoint(
             name="small-oanet",
             file="small-oanet.pt",
-            sha256="25ccdefbd56eda230e507ed2bcaf4b2d78c93f2f97f61e963462eb88ff8cc8b7",
+            sha256="87bdb992d1262d5f1c3cf39cd7c5c59511e0a5a4d32366abb3dfaa1d92ab8e02",
             config=RivalConfig(architecture="oanet", channels=32, clusters=48, side_channels=5),
             licence="Apache-2.0",
             training_data="pairs of 54 photo scenes with COLMAP poses; the model card says which",

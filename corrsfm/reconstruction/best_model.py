@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -172,12 +173,15 @@ def select_model(
         refinement=refinement,
     )
     cameras_of = {candidate.name: candidate.cameras for candidate in bank}
+    max_seconds = round(policy.max_time_factor * first_seconds) + 1
+    # On a weak pair graph each attempt may go on for minutes.
+    seconds_to_mend = float(max_seconds)
     with CandidatePool(
         database,
         workdir,
         refinement=refinement,
         num_processes=num_processes,
-        max_runtime_seconds=round(policy.max_time_factor * first_seconds) + 1,
+        max_runtime_seconds=max_seconds,
     ) as pool:
 
         def map_round(candidates: Sequence[Candidate]) -> list[Tried | None]:
@@ -196,6 +200,10 @@ def select_model(
             ]
 
         def mend(model: Tried) -> Tried | None:
+            nonlocal seconds_to_mend
+            if seconds_to_mend < 1:
+                return None
+            started = time.monotonic()
             again = register_again(
                 models[model.name],
                 model.explained.misplaced,
@@ -204,13 +212,16 @@ def select_model(
                 cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
                 seed=seed,
                 refinement=refinement,
+                max_runtime_seconds=round(seconds_to_mend),
             )
+            seconds = time.monotonic() - started
+            seconds_to_mend -= seconds
             if again is None:
                 return None
             name = model.name + _MENDED
             # It may have photos to register once more.
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
-            return tried(name, again, first_seconds, way=model.way, has_more_cameras=model.has_more_cameras)
+            return tried(name, again, seconds, way=model.way, has_more_cameras=model.has_more_cameras)
 
         start, others = None, []
         if first is not None:

@@ -37,6 +37,7 @@ def register_again(
     seed: int = 0,
     refinement: Refinement = DEFAULT_REFINEMENT,
     num_threads: int = 1,
+    max_runtime_seconds: int = 0,
 ) -> pycolmap.Reconstruction | None:
     """Take photos out of a model, and go on mapping from there with lenient thresholds.
 
@@ -56,6 +57,9 @@ def register_again(
     refinement : Refinement
     num_threads : int
         With 1 equal arguments give equal models.
+    max_runtime_seconds : int
+        Mapping stops after so long, once the photo at hand is done with; 0 for no limit. A photo that no
+        points hold yet, only pairs, can take a minute.
 
     Returns
     -------
@@ -89,6 +93,8 @@ def register_again(
         database = copy
     candidate = Candidate(mapper=MapperKind.RELAXED, seed=seed)
     options = incremental_options(candidate, refinement, num_threads)
+    if max_runtime_seconds:
+        options.max_runtime_seconds = max_runtime_seconds
     with colmap_log(), database_errors(database):
         pycolmap.set_random_seed(seed)
         models = pycolmap.incremental_mapping(database, workdir, found, options, input_path=given)

@@ -1,8 +1,10 @@
 """Photos taken out of a model and registered again."""
 
 from pathlib import Path
+from typing import Any
 
 import pycolmap
+import pytest
 from scene_of_points import bend
 from synthetic_database import synthesize
 
@@ -76,4 +78,19 @@ def test_nothing_is_left_to_start_from(tmp_path: Path) -> None:
     truth = synthesize(tmp_path / "database.db")
     names = list(views_of(truth))[1:]
     assert register_again(truth, names, tmp_path / "database.db", tmp_path / "work") is None
+
+
+def test_mapping_on_from_there_has_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = synthesize(tmp_path / "database.db")
+    bounds = []
+
+    def mapping(*given: Any, **_: Any) -> dict[int, pycolmap.Reconstruction]:
+        bounds.append(given[3].max_runtime_seconds)
+        return {}
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    name = next(iter(truth.images.values())).name
+    for given in ({}, {"max_runtime_seconds": 7}):
+        assert register_again(truth, [name], tmp_path / "database.db", tmp_path / "work", **given) is None
+    assert bounds[0] <= 0 and bounds[1] == 7
     assert not (tmp_path / "work").exists()
