@@ -7,7 +7,7 @@ import cv2  # noqa: F401  (before pycolmap)
 import numpy as np
 import pycolmap
 import pytest
-from photos import write_photos
+from photos import SIZE, write_photos
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
@@ -39,6 +39,9 @@ def workspace(tmp_path: Path) -> Workspace:
     prune(workspace, 0.8)
     (workspace.sparse / "0").mkdir(parents=True)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_frames_per_rig=3, num_points3D=20)
+    height, width = SIZE
+    options.camera_width, options.camera_height = width, height
+    options.camera_params = [float(width), width / 2, height / 2, 0.0]
     model = pycolmap.synthesize_dataset(options)
     names = read_index(workspace).names
     for image, name in zip(model.images.values(), names, strict=True):
