@@ -5,7 +5,7 @@ and sums that make a squared distance are integers that their type holds exactly
 on block size, number of threads or device, and equal distances compare equal. (bfloat16 and float16 could
 hold the bytes, but not the sums.)
 
-A processor that multiplies bytes exactly (AVX-512 VNNI) gets bytes: a tenth of the time of float32.
+A processor that multiplies bytes exactly (AVX-512 VNNI) gets bytes: matching then takes a fifth of its time.
 """
 
 from __future__ import annotations

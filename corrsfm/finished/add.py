@@ -301,7 +301,7 @@ class _Addition:
                 config.image_list,
             )
         workspace, given = self._workspace, self._workspace.given_photos
-        if workspace.images_dir in (workspace.frames, workspace.converted):
+        if workspace.has_own_photos:
             if str(workspace.images_dir.resolve()) not in given:
                 logger.warning(
                     "a run of %s leaves the new photos out; to go on with them: %s",

@@ -6,7 +6,6 @@ import shlex
 
 from corrsfm.report.missing import MissingPhoto, MissingReason
 from corrsfm.workspace import Workspace
-from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.imported import imported_from
 
 __all__ = ["command_again", "more_photos_to_add", "more_photos_to_map", "next_step"]
@@ -26,8 +25,7 @@ def command_again(workspace: Workspace, stage: str, *flags: str, images_dir: str
     images_dir : str, optional
         As for `Workspace.command_for`.
     """
-    stages = list(STAGE_COMMANDS)
-    first, *others = dict.fromkeys(workspace.command_for(one) for one in stages[stages.index(stage) :])
+    _, *others = workspace.commands_from(stage)
     return "; ".join([workspace.command_for(stage, *flags, images_dir=images_dir), *others])
 
 

@@ -223,7 +223,7 @@ def _photos(scene: Workspace) -> list[SceneFinding]:
     missing, changed = photos_unlike(records, scene.images_dir, PhotoCache(scene.photo_cache))
     found, source = [], None
     # Frames and converted photos are made again, but photos that were added lie among them alone.
-    are_ours = scene.images_dir in (scene.frames, scene.converted)
+    are_ours = scene.has_own_photos
     if are_ours and read_added(scene):
         source, are_ours = str(scene.images_dir), False
     elif are_ours and not all(map(os.path.exists, scene.given_photos)):

@@ -160,7 +160,7 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
             f"{folder}: holds files of others, and the frames of {video.name} would go there; choose another "
             "workspace, or give that folder itself as photos"
         )
-    key = {"version": _VERSION, "sha256": hash_of(video)}
+    key = _key_of(video, hash_of)
     try:
         values = read_json(path)
         if values.pop("key") == key:
@@ -182,10 +182,15 @@ def _measured(video: Path, folder: Path, hash_of: Callable[[Path], str], track: 
     return measured
 
 
-def are_frames_of(video: Path, folder: Path, *, hash_of: Callable[[Path], str] = sha256_of) -> bool:
+def _key_of(video: Path, hash_of: Callable[[Path], str]) -> dict[str, Any]:
+    """What measurements of a video are kept under."""
+    return {"version": _VERSION, "sha256": hash_of(video)}
+
+
+def are_frames_of(video: Path, folder: Path) -> bool:
     """Whether the frames in a folder are those of a video, wherever that was when they were taken."""
     try:
-        return read_json(folder / OWN_RECORD)["key"] == {"version": _VERSION, "sha256": hash_of(video)}
+        return read_json(folder / OWN_RECORD)["key"] == _key_of(video, sha256_of)
     except (OSError, ValueError, KeyError, TypeError):
         return False
 

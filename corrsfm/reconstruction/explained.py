@@ -115,12 +115,13 @@ class Explained:
         Few are those that hold 12 % of the verified matches of registered photos at most: parts of a scene
         that are put together wrongly contradict more.
         """
+        few = self.are_contradicted_within(MOST_CONTRADICTED)
+        return few and self.share_of_supported >= ENOUGH_SUPPORTED_SHARE
+
+    def are_contradicted_within(self, share: float) -> bool:
+        """Whether contradicted pairs hold at most this share of the verified matches of registered photos."""
         num_verified = sum(pair.num_verified for pair in self.pairs if pair.is_registered)
-        num_against = sum(pair.num_verified for pair in self.contradicted)
-        return (
-            self.share_of_supported >= ENOUGH_SUPPORTED_SHARE
-            and num_against <= MOST_CONTRADICTED * num_verified
-        )
+        return sum(pair.num_verified for pair in self.contradicted) <= share * num_verified
 
     @property
     def contradicted(self) -> tuple[ExplainedPair, ...]:

@@ -244,14 +244,12 @@ def _explained(evidence: Evidence) -> _Finding | None:
 
 def _contradicted(evidence: Evidence) -> _Finding | None:
     explained = evidence.explained
-    inside = [pair for pair in explained.pairs if pair.is_registered and pair.num_verified]
-    num_verified = sum(pair.num_verified for pair in inside)
-    num_against = sum(pair.num_verified for pair in explained.contradicted)
-    if num_against <= _GOOD_CONTRADICTED * num_verified:
+    if explained.are_contradicted_within(_GOOD_CONTRADICTED):
         return None
+    inside = [pair for pair in explained.pairs if pair.is_registered and pair.num_verified]
     worst = first_few(f"{pair.name0} – {pair.name1}" for pair in explained.contradicted)
     return _Finding(
-        Grade.DOUBTFUL if num_against <= _WRONG_CONTRADICTED * num_verified else Grade.WRONG,
+        Grade.DOUBTFUL if explained.are_contradicted_within(_WRONG_CONTRADICTED) else Grade.WRONG,
         f"{len(explained.contradicted)} of {len(inside)} verified pairs contradict it ({worst})",
         "leaving out the photos that most contradicted pairs have in common",
     )

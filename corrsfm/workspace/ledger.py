@@ -15,7 +15,7 @@ from corrsfm.colmap.sqlite import rows_digest
 from corrsfm.disk import explain
 from corrsfm.errors import WorkspaceError
 from corrsfm.files import FRAME_TIMES, read_bytes, sha256_of
-from corrsfm.workspace.commands import command_for, label_of
+from corrsfm.workspace.commands import STAGE_COMMANDS, command_for, label_of
 from corrsfm.workspace.layout import Layout
 from corrsfm.workspace.manifest import StageRecord, write_manifest
 
@@ -70,6 +70,11 @@ class Ledger(Layout):
         inside = resolved in (self.frames.resolve(), self.converted.resolve())
         self._values["images_dir"] = str(resolved.relative_to(root) if inside else resolved)
         self._write()
+
+    @property
+    def has_own_photos(self) -> bool:
+        """Whether the photos lie in the workspace: frames of a video, or readable copies."""
+        return self.images_dir in (self.frames, self.converted)
 
     @property
     def given_photos(self) -> tuple[str, ...]:
@@ -162,6 +167,11 @@ class Ledger(Layout):
             return self.require(stage)
         except WorkspaceError:
             return None
+
+    def commands_from(self, stage: str) -> list[str]:
+        """The commands that make a stage and all that hang on it, in order."""
+        stages = list(STAGE_COMMANDS)
+        return list(dict.fromkeys(map(self.command_for, stages[stages.index(stage) :])))
 
     def command_for(
         self, stage: str, *flags: str, images_dir: str | None = None, imported: dict[str, Any] | None = None

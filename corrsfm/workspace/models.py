@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 from corrsfm.colmap.models import read_models
 from corrsfm.errors import WorkspaceError, first_few
 from corrsfm.files import atomic_path, sha256_of
-from corrsfm.workspace.commands import STAGE_COMMANDS
 from corrsfm.workspace.folder import Workspace
 from corrsfm.workspace.lists import read_index
 
@@ -112,9 +111,9 @@ def _mapping_again(workspace: Workspace) -> str:
     """The commands that map again; an addition that was interrupted needs the models, and is given up."""
     if not workspace.adding.exists():
         return workspace.command_for("models", "--overwrite")
-    stages = [*dict.fromkeys(map(workspace.command_for, list(STAGE_COMMANDS)[:-1]))]
     giving_up = shlex.join(["rm", str(workspace.adding)])
-    return "; ".join([giving_up, *stages, workspace.command_for("models", "--overwrite")])
+    *others, _ = workspace.commands_from("images")
+    return "; ".join([giving_up, *others, workspace.command_for("models", "--overwrite")])
 
 
 def others_in_models(workspace: Workspace) -> list[Path]:

@@ -36,6 +36,17 @@ from corrsfm.workspace import Workspace
 RUN = CONFIG.run
 
 
+def interrupt(scene: SceneToGrow, monkeypatch: pytest.MonkeyPatch, where: object, step: str) -> None:
+    """Begin an addition that is interrupted when it comes to a step."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(where, step, stop)
+        add_photos(scene.workspace, scene.new, run=RUN)
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> SceneToGrow:
     return make_scene_to_grow(tmp_path_factory.mktemp("grow"))
@@ -241,12 +252,7 @@ def test_refine_moves_what_is_there(made: SceneToGrow, scene: SceneToGrow) -> No
 def test_an_interrupted_addition_goes_on_where_it_was(
     scene: SceneToGrow, grown: SceneToGrow, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(grown_models if hasattr(grown_models, step) else adding, step, interrupt)
-        add_photos(scene.workspace, scene.new, run=RUN)
+    interrupt(scene, monkeypatch, grown_models if hasattr(grown_models, step) else adding, step)
     if step != "report":
         with pytest.raises(WorkspaceError, match="run: corrsfm add"):
             Workspace(scene.workspace).require("models")
@@ -260,12 +266,7 @@ def test_an_interrupted_addition_goes_on_where_it_was(
 def test_an_interruption_while_models_are_replaced_loses_none(
     scene: SceneToGrow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(grown_models, "grow", interrupt)
-        add_photos(scene.workspace, scene.new, run=RUN)
+    interrupt(scene, monkeypatch, grown_models, "grow")
     (scene.workspace / "sparse").rename(scene.workspace / ".sparse.corrsfm.old")
     result = add_photos(scene.workspace, run=RUN)
     assert [photo.model for photo in result.photos] == [0, 0]
@@ -299,12 +300,7 @@ def test_a_photo_that_is_a_link_goes_by_its_own_name(tmp_path: Path) -> None:
 def test_a_photo_exchanged_during_an_addition_is_named_and_nothing_is_made_of_it(
     scene: SceneToGrow, grown: SceneToGrow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(adding._Addition, "finish", interrupt)
-        add_photos(scene.workspace, scene.new, run=RUN)
+    interrupt(scene, monkeypatch, adding._Addition, "finish")
     name = scene.new_names[0]
     for content in ((scene.new / scene.new_names[1]).read_bytes(), b"cut"):
         (scene.photos / name).write_bytes(content)
@@ -349,12 +345,7 @@ def test_nothing_is_added_to_a_damaged_model(scene: SceneToGrow, how: str) -> No
 def test_a_model_damaged_during_an_addition_is_made_again_by_the_commands_that_are_named(
     scene: SceneToGrow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(adding, "match_pairs", interrupt)
-        add_photos(scene.workspace, scene.new, run=RUN)
+    interrupt(scene, monkeypatch, adding, "match_pairs")
     damage(scene, "cut off")
     with pytest.raises(WorkspaceError, match="damaged") as told:
         add_photos(scene.workspace, run=RUN)

@@ -78,6 +78,7 @@ def test_nothing_is_left_to_start_from(tmp_path: Path) -> None:
     truth = synthesize(tmp_path / "database.db")
     names = list(views_of(truth))[1:]
     assert register_again(truth, names, tmp_path / "database.db", tmp_path / "work") is None
+    assert not (tmp_path / "work").exists()
 
 
 def test_mapping_on_from_there_has_a_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
