@@ -1,6 +1,7 @@
 """What this process runs on."""
 
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -65,3 +66,19 @@ def test_a_process_ends_with_the_one_that_holds_its_pipe() -> None:
         process.wait(1)
     process.communicate()
     assert process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc is told to keep freed memory")
+def test_freed_memory_is_taken_again_and_not_given_back() -> None:
+    def new_pages(first: str) -> int:
+        """Pages that a process gets from the system while it takes and frees 8 MiB ten times more."""
+        code = (
+            f"import resource\n{first}\n"
+            "def take():\n    [bytearray(2**20) for _ in range(8)]\n"
+            "def pages():\n    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+            "take()\nbefore = pages()\nfor _ in range(10):\n    take()\nprint(pages() - before)\n"
+        )
+        return int(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
+
+    kept = new_pages("from corrsfm.machine import keep_freed_memory\nkeep_freed_memory()")
+    assert kept < new_pages("") / 10

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from corrsfm.config import MatchInput, OperatingPoint, Precision, PruneConfig, to_dict
 from corrsfm.errors import CheckpointError, CorrsfmError, InputError
-from corrsfm.machine import count_threads, find_device
+from corrsfm.machine import count_threads, find_device, keep_freed_memory
 from corrsfm.model import CorrAdaptor, Rival, RivalOutput, load_network, weights
 from corrsfm.prune.correspondences import SIDE_LAYOUTS, missing_channels, side_information
 from corrsfm.prune.robust import normalised_residuals
@@ -161,6 +161,8 @@ class Pruner:
         self.trained_on = network.usage.features
         self._usage = network.usage
         self._min_matches = math.ceil(_MIN_NUM_FOR_MATRIX / network.pruning_ratio**2)
+        if self.device.type == "cpu":
+            keep_freed_memory()
         self._network: Callable = network.to(self.device).eval()
         if compile:
             self._network = torch.compile(network, dynamic=True)
