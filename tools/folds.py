@@ -1,0 +1,81 @@
+"""What unfolding does to scenes, folded ones and others, over several seeds.
+
+    python tools/folds.py results/folds.json SCENE … [--seeds 5] [--work DIR]
+
+Each SCENE is a folder with images/ and a COLMAP model of known cameras. Every seed verifies and maps with corrsfm's
+defaults; where a model was unfolded, the same seed is mapped again with --no-unfold. Each scene is saved as soon
+as it is done, and what the result file or --work hold already is not done again.
+"""
+
+import argparse
+import json
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+from corrsfm.evaluation.records import provenance, save_results
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from tools.whole_scenes import call, measure  # noqa: E402
+
+
+def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
+    """One seed of a scene: what was noticed and done, and the score with and without it."""
+
+    def reconstruct(*flags: str) -> tuple[dict[str, Any], dict[str, Any]]:
+        workspace = pruned.with_name("workspace")
+        shutil.rmtree(workspace, ignore_errors=True)
+        shutil.copytree(pruned, workspace)
+        for command in (["prune"], ["reconstruct", *flags]):
+            call("-m", "corrsfm", "-q", command[0], workspace, *command[1:], "--seed", seed, "--threads", 1)
+        evidence = workspace / "evidence.json"
+        found = json.loads(evidence.read_text(encoding="utf-8")) if evidence.exists() else {}
+        return measure(workspace, scene, seed), found
+
+    row, evidence = reconstruct()
+    folds = evidence.get("folds", {})
+    names = [model["name"] for model in evidence.get("models_tried", []) if model["chosen"]]
+    row |= {
+        "unfolded_by": next((name for name in names if name.startswith("unfolded")), None),
+        "still_folded": folds.get("folded"),
+        "num_near_pairs": folds.get("num_near_pairs"),
+        "num_left_out": len(folds.get("left_out", [])),
+    }
+    if row["unfolded_by"]:
+        plain, evidence = reconstruct("--no-unfold")
+        row["without"] = plain | {"folded": evidence.get("folds", {}).get("folded")}
+    return row
+
+
+def main() -> None:
+    """Measure every scene and seed, and save after each scene."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("results", type=Path)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--work", type=Path, default=Path("runs/folds"))
+    arguments = parser.parse_args()
+    rows: dict[str, Any] = {}
+    if arguments.results.exists():
+        rows = json.loads(arguments.results.read_text(encoding="utf-8"))["rows"]
+    for scene in arguments.scenes:
+        if scene.name in rows:
+            continue
+        pruned = arguments.work / scene.name / "pruned"
+        for words in (["extract", scene / "images", pruned], ["prune", pruned]):
+            call("-m", "corrsfm", "-q", *words, "--threads", 1)
+        rows[scene.name] = [run_seed(scene, pruned, seed) for seed in range(arguments.seeds)]
+        shutil.rmtree(pruned.parent)
+        command = shlex.join(["python", "tools/folds.py", *sys.argv[1:]])
+        save_results(
+            arguments.results, "folds", {"provenance": provenance(seed=0, command=command), "rows": rows}
+        )
+        print(scene.name, *rows[scene.name], sep="\n  ", flush=True)
+
+
+if __name__ == "__main__":
+    main()
