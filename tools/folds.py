@@ -2,9 +2,9 @@
 
     python tools/folds.py results/folds.json SCENE … [--seeds 5] [--work DIR]
 
-Each SCENE is a folder with images/ and a COLMAP model of known cameras. Every seed verifies and maps with corrsfm's
-defaults; where a model was unfolded, the same seed is mapped again with --no-unfold. Each scene is saved as soon
-as it is done, and what the result file or --work hold already is not done again.
+Each SCENE is a folder with images/ and a COLMAP model of known cameras. Every seed verifies and maps with
+corrsfm's defaults; where a model was unfolded, the same seed is mapped again with --no-unfold. Each scene is
+saved as soon as it is done, and what the result file holds already is not done again.
 """
 
 import argparse

@@ -1,14 +1,15 @@
-"""Tables and a picture of what the project measures of itself: growth with the scene, reliability, costs.
+"""Tables and a picture of what the project measures of itself: growth, reliability, costs, folds.
 
 `tools/growth.py` and `tests/reliability/run.py` measure and keep their rows by `keep_row`,
-`tools/rivals_cost.py` writes its file at once; `tools/tables.py` shows them.
+`tools/rivals_cost.py` and `tools/folds.py` write their files themselves; `tools/tables.py` shows them.
 """
 
 from __future__ import annotations
 
 import html
 import math
-from collections.abc import Callable, Mapping, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,40 @@ def _costs_table(values: dict[str, Any]) -> Table:
     ]
     machine = values["provenance"]["machine"]["processor"]
     return Table(header=header, rows=rows, caption=f"One core of {machine}.")
+
+
+def _folds_table(values: dict[str, Any]) -> Table:
+    """Scenes of which a model was unfolded or called folded; the caption counts the others."""
+    header = ["scene", "photos", "unfolded", "called folded", "AUC@5 with --no-unfold", "AUC@5"]
+    rows, quiet = [], []
+    for scene, runs in values["rows"].items():
+        unfolded = sum(run["unfolded_by"] is not None for run in runs)
+        folded = sum(bool(run["still_folded"]) for run in runs)
+        if not unfolded and not folded:
+            quiet.append(runs)
+            continue
+        rows.append(
+            [
+                scene,
+                str(runs[0]["num_photos"]),
+                *(f"{number} of {len(runs)}" for number in (unfolded, folded)),
+                *(_median_and_worst(auc) for auc in (map(_auc_without, runs), (run["auc5"] for run in runs))),
+            ]
+        )
+    caption = (
+        f"AUC@5: median (worst). On {len(quiet)} other scenes, in {sum(map(len, quiet))} runs, nothing was "
+        "unfolded or called folded."
+    )
+    return Table(header=header, rows=rows, caption=caption)
+
+
+def _auc_without(run: dict[str, Any]) -> float:
+    return float(run.get("without", run)["auc5"])
+
+
+def _median_and_worst(numbers: Iterable[float]) -> str:
+    numbers = list(numbers)
+    return f"{statistics.median(numbers):.1f} ({min(numbers):.1f})"
 
 
 def _machine(values: dict[str, Any]) -> str:
@@ -165,6 +200,7 @@ def _text(x: float, y: float, text: str, anchor: str, colour: str = "#333", *, b
 
 HOUSE_TABLES: dict[str, Callable[[dict[str, Any]], Table]] = {
     "costs": _costs_table,
+    "folds": _folds_table,
     "growth": _growth_table,
     "reliability": _reliability_table,
 }
