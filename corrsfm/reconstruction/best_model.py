@@ -240,7 +240,7 @@ def select_model(
             return None
         attempt = judge_model(models[start.name], evidence.verified)
         if unfold:
-            best = _unfolded(attempt, evidence, database, workdir, seed, refinement)
+            best = _unfolded(attempt, evidence, database, workdir, seed, refinement, max_seconds)
             if best is not attempt:
                 return _selection_of(best, start, evidence, first_seconds)
         choice = choose_model(
@@ -284,22 +284,37 @@ def _unfolded(
     workdir: Path,
     seed: int,
     refinement: Refinement,
+    max_seconds: int,
 ) -> Attempt:
     """The best model without pairs that fold the first one; or the first one.
 
-    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
+    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little. All
+    attempts together are bounded as one candidate is: those of a weak pair graph take minutes.
     """
+    end = time.monotonic() + max_seconds
+
+    def map_without(removed: Sequence[Pair]) -> pycolmap.Reconstruction | None:
+        seconds = round(end - time.monotonic())
+        if seconds < 1:
+            return None
+        return _map_without(removed, database, workdir / "unfolded", seed, refinement, seconds)
+
     attempts = try_unfolding(
         first,
         evidence.verified,
-        lambda removed: _map_without(removed, database, workdir / "unfolded", seed, refinement),
+        map_without,
         rules=tuple(UnfoldRule) if first.evidence.folded else (UnfoldRule.VOTES,),
     )
     return best_unfolding(first, attempts)
 
 
 def _map_without(
-    removed: Sequence[Pair], database: Path, workdir: Path, seed: int, refinement: Refinement
+    removed: Sequence[Pair],
+    database: Path,
+    workdir: Path,
+    seed: int,
+    refinement: Refinement,
+    max_runtime_seconds: int,
 ) -> pycolmap.Reconstruction | None:
     """The model of the verified pairs without some of them."""
     shutil.rmtree(workdir, ignore_errors=True)
@@ -311,7 +326,9 @@ def _map_without(
         for name0, name1 in removed:
             tables.delete_two_view_geometry(ids[name0], ids[name1])
     candidate = Candidate(mapper=MapperKind.INCREMENTAL, seed=seed)
-    return map_candidate(candidate, copy, workdir / "model", refinement=refinement)
+    return map_candidate(
+        candidate, copy, workdir / "model", refinement=refinement, max_runtime_seconds=max_runtime_seconds
+    )
 
 
 def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first_seconds: float) -> Selection:

@@ -1,8 +1,10 @@
 """The first model stays if it convinces; a bent one gives way to the true one, and the record says why."""
 
 import dataclasses
+import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -121,6 +123,28 @@ def test_all_that_the_round_of_a_stand_in_mapped_is_chosen_from(
     selected = scene.select(None, unfold=False)
     assert selected is not None
     assert selected.model is scene.truth
+
+
+def test_all_attempts_to_unfold_have_the_time_of_one_candidate(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = itertools.count(start=0, step=100)
+    monkeypatch.setattr(best_model, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    bounds, outcomes = [], []
+
+    def map_candidate(*given: object, max_runtime_seconds: int, **more: object) -> pycolmap.Reconstruction:
+        bounds.append(max_runtime_seconds)
+        return scene.truth
+
+    def try_unfolding(first: object, verified: object, map_without: Any, *, rules: object) -> list:
+        outcomes.extend(map_without([]) for _ in range(2))
+        return []
+
+    monkeypatch.setattr(best_model, "map_candidate", map_candidate)
+    monkeypatch.setattr(best_model, "try_unfolding", try_unfolding)
+    assert scene.select(scene.truth) is not None
+    assert bounds == [round(policy_for(8, 1.0).max_time_factor) + 1 - 100]
+    assert outcomes == [scene.truth, None]
 
 
 def test_candidates_hold_intrinsics_as_the_first_model_did(
