@@ -33,6 +33,7 @@ __all__ = [
     "read_image",
     "read_mask",
     "read_photo_info",
+    "read_small",
     "stored_size",
 ]
 
@@ -44,6 +45,7 @@ _LARGEST_SEGMENT = 65533
 # Of the largest sensors there are 200 million.
 _MOST_PIXELS = 1 << 28
 _LARGEST_BYTES = (1 << 31) - 1
+_REDUCED_KINDS = {8: cv2.IMREAD_REDUCED_COLOR_8, 4: cv2.IMREAD_REDUCED_COLOR_4, 2: cv2.IMREAD_REDUCED_COLOR_2}
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -119,6 +121,38 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     """
     advice = "re-export or remove the photo"
     return _as_bytes(path, _decode(path, advice, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+
+
+def read_small(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float]:
+    """Read a photo in colour and scale it down, as `read_colour` and in less time.
+
+    Returns
+    -------
+    photo : (H, W, 3) uint8
+        OpenCV's order of channels, blue first.
+    scale : float
+        Size of the result over size of the file, at most 1.
+
+    Raises
+    ------
+    ImageError, DependencyError
+        As `read_image`.
+    """
+    advice, kind = "re-export or remove the photo", cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+    reduced = 1
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        with _opened(path, advice) as file:
+            longest = max(declared_size(file) or (0, 0))
+        # libjpeg leaves out what a smaller picture does not need.
+        for factor, reduced_kind in _REDUCED_KINDS.items():
+            if longest >= factor * max_size:
+                reduced, kind = factor, reduced_kind
+                break
+    photo = _as_bytes(path, _decode(path, advice, kind))
+    scale = min(1.0, max_size / max(photo.shape[:2]))
+    size = (max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale)))
+    by = cv2.INTER_AREA if scale < 0.5 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(photo, size, interpolation=by), np.uint8), scale / reduced
 
 
 def _decode(path: Path, advice: str, kind: int = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) -> NDArray:

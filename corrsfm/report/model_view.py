@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import dataclass
 
 import numpy as np
@@ -183,36 +184,34 @@ def plotly_view(view: ModelView) -> str:
         If plotly is not installed.
     """
     try:
-        import plotly.graph_objects as graph_objects
+        import plotly.io
     except ImportError as error:
         raise DependencyError("plotly", "the interactive 3-D view", "report") from error
-    points = view.points.astype(np.float32)
-    cloud = graph_objects.Scatter3d(
-        x=points[:, 0], y=points[:, 1], z=points[:, 2], mode="markers", name="points", hoverinfo="skip",
-        marker={"size": 1.6, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in view.colours]},
-    )  # fmt: skip
-    lines = _frustum_lines(view.frusta).astype(np.float32)
-    frusta = graph_objects.Scatter3d(
-        x=lines[:, 0], y=lines[:, 1], z=lines[:, 2], mode="lines", name="cameras", hoverinfo="skip",
-        line={"color": DROPPED_COLOUR, "width": 2},
-    )  # fmt: skip
-    centres = view.centres.astype(np.float32)
-    photos = graph_objects.Scatter3d(
-        x=centres[:, 0], y=centres[:, 1], z=centres[:, 2], mode="markers", name="photos",
-        text=list(view.names), hovertemplate="%{text}<extra></extra>",
-        marker={"size": 3, "color": DROPPED_COLOUR},
-    )  # fmt: skip
-    figure = graph_objects.Figure(
-        [cloud, frusta, photos],
-        layout={
-            "scene": _first_look(view),
-            "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
-            "showlegend": False,
-            "paper_bgcolor": "rgba(0,0,0,0)",
-            "modebar": {"bgcolor": "rgba(0,0,0,0)"},
-        },
-    )
-    return figure.to_html(
+    cloud = {
+        "type": "scatter3d", **_places(view.points), "mode": "markers",
+        "name": "points", "hoverinfo": "skip",
+        "marker": {"size": 1.6, "color": [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in view.colours]},
+    }  # fmt: skip
+    frusta = {
+        "type": "scatter3d", **_places(_frustum_lines(view.frusta)), "mode": "lines",
+        "name": "cameras", "hoverinfo": "skip", "line": {"color": DROPPED_COLOUR, "width": 2},
+    }  # fmt: skip
+    photos = {
+        "type": "scatter3d", **_places(view.centres), "mode": "markers",
+        "name": "photos", "text": list(view.names), "hovertemplate": "%{text}<extra></extra>",
+        "marker": {"size": 3, "color": DROPPED_COLOUR},
+    }  # fmt: skip
+    layout = {
+        "scene": _first_look(view),
+        "margin": {"l": 0, "r": 0, "t": 0, "b": 0},
+        "showlegend": False,
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "modebar": {"bgcolor": "rgba(0,0,0,0)"},
+    }
+    # Plotly's own objects would check each value, for a third of the page's time.
+    page: str = plotly.io.to_html(
+        {"data": [cloud, frusta, photos], "layout": layout},
+        validate=False,
         full_html=False,
         include_plotlyjs=True,
         include_mathjax=False,
@@ -226,6 +225,16 @@ def plotly_view(view: ModelView) -> str:
             "plotlyServerURL": "",
         },
     )
+    return page
+
+
+def _places(points: NDArray[np.float64]) -> dict[str, dict[str, str]]:
+    """The coordinates of points (N, 3) as plotly reads them in fewest bytes."""
+    columns = np.ascontiguousarray(points.T, dtype="<f4")
+    return {
+        axis: {"dtype": "f4", "bdata": base64.b64encode(column).decode("ascii")}
+        for axis, column in zip("xyz", columns, strict=True)
+    }
 
 
 def _first_look(view: ModelView) -> dict[str, object]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from corrsfm.errors import ImageError
-from corrsfm.images.photos import read_colour
+from corrsfm.images.photos import read_small
 from corrsfm.types import PairStatistics
 
 __all__ = [
@@ -58,12 +58,9 @@ def read_photo(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float] | N
     None if the photo is missing or unreadable; the page then leaves it out.
     """
     try:
-        photo = read_colour(path)
+        return read_small(path, max_size)
     except ImageError:
         return None
-    scale = min(1.0, max_size / max(photo.shape[:2]))
-    size = (max(1, round(photo.shape[1] * scale)), max(1, round(photo.shape[0] * scale)))
-    return np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA), np.uint8), scale
 
 
 def draw_matches(

@@ -17,7 +17,7 @@ from corrsfm.errors import ImageError, InputError
 from corrsfm.files import sha256_of
 from corrsfm.images.index import duplicate_images, index_images, name_remarks
 from corrsfm.images.listing import holds_pictures, list_images
-from corrsfm.images.photos import read_image, read_mask, read_photo_info
+from corrsfm.images.photos import read_colour, read_image, read_mask, read_photo_info, read_small
 
 
 def picture(seed: int = 0, shape: tuple[int, ...] = (48, 64), depth: type = np.uint8) -> NDArray:
@@ -372,3 +372,17 @@ def test_a_pipe_named_like_a_photo_is_refused_and_not_waited_for(tmp_path: Path)
     os.mkfifo(tmp_path / "c.jpg")
     with pytest.raises(InputError, match=r"pipes, devices or folders are named like photos: c\.jpg; remove"):
         list_images(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("size", [(480, 640), (481, 643), (47, 1280), (100, 120)])
+def test_a_small_photo_is_the_large_one_scaled_down(
+    tmp_path: Path, size: tuple[int, int], suffix: str
+) -> None:
+    path = write(tmp_path / f"photo{suffix}", cv2.GaussianBlur(picture(1, (*size, 3)), (0, 0), 4.0))
+    small, scale = read_small(path, 150)
+    large = read_colour(path)
+    assert max(small.shape[:2]) == min(150, max(size))
+    assert scale == pytest.approx(min(1.0, 150 / max(size)), rel=0.01)
+    expected = cv2.resize(large, small.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(small.astype(int) - expected).mean() < 2

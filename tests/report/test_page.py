@@ -120,7 +120,7 @@ def test_photos_that_are_missing_are_shown_with_their_reason(model, photos: Path
 
 
 def test_page_needs_neither_plotly_nor_photos(model, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
+    monkeypatch.setitem(sys.modules, "plotly.io", None)
     path = tmp_path / "report.html"
     write_html(report_of(model), path, model=model, images_dir=tmp_path / "gone", load_matches=matches(model))
     text = page(path)
