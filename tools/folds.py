@@ -1,10 +1,11 @@
 """What unfolding does to scenes, folded ones and others, over several seeds.
 
-    python tools/folds.py results/folds.json SCENE … [--seeds 5] [--work DIR]
+    python tools/folds.py results/folds.json SCENES [--splits train,val] [--largest 14] [--also NAMES]
 
-Each SCENE is a folder with images/ and a COLMAP model of known cameras. Every seed verifies and maps with
-corrsfm's defaults; where a model was unfolded, the same seed is mapped again with --no-unfold. Each scene is
-saved as soon as it is done, and what the result file holds already is not done again.
+SCENES holds a folder a scene, each with images/ and a COLMAP model of known cameras, and splits.json. Every
+seed verifies and maps with corrsfm's defaults; where a model was unfolded, the same seed is mapped again with
+--no-unfold. Small scenes come first. Each is saved as soon as it is done, and what the result file holds
+already is not done again.
 """
 
 import argparse
@@ -55,26 +56,33 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("results", type=Path)
-    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("scenes", type=Path)
+    parser.add_argument("--splits", default="train,val")
+    parser.add_argument("--largest", type=int, default=14, help="photos of the largest scene")
+    parser.add_argument("--also", default="", help="names of larger scenes")
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--work", type=Path, default=Path("runs/folds"))
     arguments = parser.parse_args()
     rows: dict[str, Any] = {}
     if arguments.results.exists():
         rows = json.loads(arguments.results.read_text(encoding="utf-8"))["rows"]
-    for scene in arguments.scenes:
-        if scene.name in rows:
+    splits = json.loads((arguments.scenes / "splits.json").read_text(encoding="utf-8"))
+    names = {name for split in arguments.splits.split(",") for name in splits[split]}
+    sizes = {name: len(list((arguments.scenes / name / "images").iterdir())) for name in sorted(names)}
+    for name in sorted(sizes, key=sizes.__getitem__):
+        scene = arguments.scenes / name
+        if name in rows or (sizes[name] > arguments.largest and name not in arguments.also.split(",")):
             continue
-        pruned = arguments.work / scene.name / "pruned"
+        pruned = arguments.work / name / "pruned"
         for words in (["extract", scene / "images", pruned], ["prune", pruned]):
             call("-m", "corrsfm", "-q", *words, "--threads", 1)
-        rows[scene.name] = [run_seed(scene, pruned, seed) for seed in range(arguments.seeds)]
+        rows[name] = [run_seed(scene, pruned, seed) for seed in range(arguments.seeds)]
         shutil.rmtree(pruned.parent)
         command = shlex.join(["python", "tools/folds.py", *sys.argv[1:]])
         save_results(
             arguments.results, "folds", {"provenance": provenance(seed=0, command=command), "rows": rows}
         )
-        print(scene.name, *rows[scene.name], sep="\n  ", flush=True)
+        print(name, *rows[name], sep="\n  ", flush=True)
 
 
 if __name__ == "__main__":
