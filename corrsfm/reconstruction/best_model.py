@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import pycolmap
 
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import copy_database, database_errors
+from corrsfm.reconstruction.budget import TimeBudget
 from corrsfm.reconstruction.calibration import (
     DEFAULT_REFINEMENT,
     Refinement,
@@ -48,13 +48,12 @@ from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair
 
-__all__ = ["Selection", "judge_as_it_is", "policy_for", "select_model"]
+__all__ = ["Selection", "judge_as_it_is", "select_model"]
 
 FIRST = "first"
 _MENDED = "+mended"
-# A large scene must not take 25 times as long; a small one is not bounded by time, on which its model would
-# depend.
-_TIMES, _SECONDS = 2.0, 120.0
+# Of the time for other models, for those without some pairs. The rest is for candidates.
+_SHARE_TO_UNFOLD = 0.5
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,12 +79,6 @@ class Selection:
     folds: FoldEvidence
     left_out: tuple[Pair, ...] = ()
     cameras: StartingCameras = StartingCameras.AS_IS
-
-
-def policy_for(max_models: int, first_seconds: float) -> ChoicePolicy:
-    """The policy within a budget: the time of two first mappings and two minutes."""
-    factor = _TIMES + _SECONDS / max(first_seconds, 1e-3)
-    return ChoicePolicy(max_models=max_models, max_time_factor=factor)
 
 
 def select_model(
@@ -173,19 +166,12 @@ def select_model(
         refinement=refinement,
     )
     cameras_of = {candidate.name: candidate.cameras for candidate in bank}
-    max_seconds = round(policy.max_time_factor * first_seconds) + 1
-    # On a weak pair graph each attempt may go on for minutes.
-    seconds_to_mend = float(max_seconds)
-    with CandidatePool(
-        database,
-        workdir,
-        refinement=refinement,
-        num_processes=num_processes,
-        max_runtime_seconds=max_seconds,
-    ) as pool:
+    budget = TimeBudget(policy.max_time_factor * first_seconds + 1)
+    with CandidatePool(database, workdir, refinement=refinement, num_processes=num_processes) as pool:
 
         def map_round(candidates: Sequence[Candidate]) -> list[Tried | None]:
-            outcomes = zip(candidates, pool.map(candidates), strict=True)
+            with budget.spent():
+                found = pool.map(candidates, max_runtime_seconds=max(budget.seconds_left, 1))
             return [
                 None
                 if model is None
@@ -196,32 +182,29 @@ def select_model(
                     way=one.mapper,
                     has_more_cameras=has_more_cameras(one.cameras),
                 )
-                for one, model in outcomes
+                for one, model in zip(candidates, found, strict=True)
             ]
 
         def mend(model: Tried) -> Tried | None:
-            nonlocal seconds_to_mend
-            if seconds_to_mend < 1:
+            if not budget.seconds_left:
                 return None
-            started = time.monotonic()
-            again = register_again(
-                models[model.name],
-                model.explained.misplaced,
-                database,
-                workdir / "again",
-                cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
-                seed=seed,
-                refinement=refinement,
-                max_runtime_seconds=round(seconds_to_mend),
-            )
-            seconds = time.monotonic() - started
-            seconds_to_mend -= seconds
+            with budget.spent() as spent:
+                again = register_again(
+                    models[model.name],
+                    model.explained.misplaced,
+                    database,
+                    workdir / "again",
+                    cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
+                    seed=seed,
+                    refinement=refinement,
+                    max_runtime_seconds=budget.seconds_left,
+                )
             if again is None:
                 return None
             name = model.name + _MENDED
             # It may have photos to register once more.
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
-            return tried(name, again, seconds, way=model.way, has_more_cameras=model.has_more_cameras)
+            return tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
 
         start, others = None, []
         if first is not None:
@@ -240,7 +223,9 @@ def select_model(
             return None
         attempt = judge_model(models[start.name], evidence.verified)
         if unfold:
-            best = _unfolded(attempt, evidence, database, workdir, seed, refinement, max_seconds)
+            with budget.spent():
+                part = TimeBudget(_SHARE_TO_UNFOLD * budget.seconds_left)
+                best = _unfolded(attempt, evidence, database, workdir, seed, refinement, part)
             if best is not attempt:
                 return _selection_of(best, start, evidence, first_seconds)
         choice = choose_model(
@@ -284,20 +269,19 @@ def _unfolded(
     workdir: Path,
     seed: int,
     refinement: Refinement,
-    max_seconds: int,
+    budget: TimeBudget,
 ) -> Attempt:
     """The best model without pairs that fold the first one; or the first one.
 
-    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little. All
-    attempts together are bounded as one candidate is: those of a weak pair graph take minutes.
+    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
     """
-    end = time.monotonic() + max_seconds
 
     def map_without(removed: Sequence[Pair]) -> pycolmap.Reconstruction | None:
-        seconds = round(end - time.monotonic())
-        if seconds < 1:
+        if not budget.seconds_left:
             return None
-        return _map_without(removed, database, workdir / "unfolded", seed, refinement, seconds)
+        with budget.spent():
+            folder = workdir / "unfolded"
+            return _map_without(removed, database, folder, seed, refinement, budget.seconds_left)
 
     attempts = try_unfolding(
         first,

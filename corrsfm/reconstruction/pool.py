@@ -13,7 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from corrsfm.files import read_json
 from corrsfm.machine import end_with_parent, hear_interruptions, unheard_by_children
@@ -40,8 +40,6 @@ class CandidatePool:
     refinement : Refinement
     num_processes : int
         1 maps in this process.
-    max_runtime_seconds : int
-        Of one candidate; 0 for no limit.
     """
 
     def __init__(
@@ -51,14 +49,10 @@ class CandidatePool:
         *,
         refinement: Refinement = DEFAULT_REFINEMENT,
         num_processes: int = 1,
-        max_runtime_seconds: int = 0,
     ) -> None:
         self._database = database
         self._workdir = workdir
-        self._options = {
-            "refinement": refinement,
-            "max_runtime_seconds": max_runtime_seconds,
-        }
+        self._refinement = refinement
         # A fork would copy pycolmap's threads in whatever state they are.
         self._executor = (
             ProcessPoolExecutor(
@@ -79,19 +73,28 @@ class CandidatePool:
         if self._executor is not None:
             self._executor.shutdown(cancel_futures=True)
 
-    def map(self, candidates: Sequence[Candidate]) -> list[pycolmap.Reconstruction | None]:
+    def map(
+        self, candidates: Sequence[Candidate], *, max_runtime_seconds: int = 0
+    ) -> list[pycolmap.Reconstruction | None]:
         """The model of each candidate in their order, None where none came out.
+
+        Parameters
+        ----------
+        candidates : sequence of Candidate
+        max_runtime_seconds : int
+            Of one candidate; 0 for no limit.
 
         Raises
         ------
         DatabaseError
             If the database cannot be read.
         """
+        options: dict[str, Any] = {
+            "refinement": self._refinement,
+            "max_runtime_seconds": max_runtime_seconds,
+        }
         if self._executor is not None:
-            jobs = [
-                (candidate, self._database, self._folder(candidate), self._options)
-                for candidate in candidates
-            ]
+            jobs = [(candidate, self._database, self._folder(candidate), options) for candidate in candidates]
             try:
                 with unheard_by_children():
                     outcomes = self._executor.map(_map_in_process, jobs)
@@ -106,7 +109,7 @@ class CandidatePool:
                 self._executor = None
         # Models do not travel between processes; all of them lie in their folders now.
         return [
-            map_candidate(candidate, self._database, self._folder(candidate), **self._options)  # type: ignore[arg-type]
+            map_candidate(candidate, self._database, self._folder(candidate), **options)
             for candidate in candidates
         ]
 
@@ -127,6 +130,6 @@ def _end_with_parent() -> None:
     hear_interruptions()
 
 
-def _map_in_process(job: tuple[Candidate, Path, Path, dict[str, object]]) -> None:
+def _map_in_process(job: tuple[Candidate, Path, Path, dict[str, Any]]) -> None:
     candidate, database, folder, options = job
-    map_candidate(candidate, database, folder, **options)  # type: ignore[arg-type]
+    map_candidate(candidate, database, folder, **options)

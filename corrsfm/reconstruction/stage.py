@@ -24,7 +24,8 @@ from corrsfm.files import atomic_write_json, remove
 from corrsfm.graph import connected_components
 from corrsfm.images.photos import stored_size
 from corrsfm.machine import count_threads
-from corrsfm.reconstruction.best_model import judge_as_it_is, policy_for, select_model
+from corrsfm.reconstruction.best_model import judge_as_it_is, select_model
+from corrsfm.reconstruction.budget import policy_for
 from corrsfm.reconstruction.calibration import Refinement
 from corrsfm.reconstruction.candidates import StartingCameras, find_cameras_on_trial
 from corrsfm.reconstruction.joining import join_models
