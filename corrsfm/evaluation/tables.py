@@ -176,6 +176,11 @@ def _compare_seeds_table(values: dict[str, Any], num_seeds: int) -> Table:
     return Table(header=header, rows=rows, caption=caption)
 
 
+# Known cameras that predict fewer matches than this share of a model's are doubted. They were not fitted to
+# these matches, so a little less is to be expected.
+_AS_MANY = 0.9
+
+
 def percent_of(share: float) -> float:
     """A share in percent, rounded down to a tenth as in verdicts: 99.97 % is not everything."""
     return math.floor(1000.0 * share) / 10.0
@@ -210,13 +215,18 @@ def _scene_table(values: dict[str, Any]) -> Table:
             *(_number(value) for value in summary["auc"].values()),
         ]
         rows.append([*row, grades_text(values["seeds"]) if name == "median" else ""])
+    caption = f"The workspace's own model is that of seed {values['seeds'][0]['seed']}."
+    if known := values.get("known_cameras"):
+        explained, predicted = known["explained_share"], known["num_predicted_matches"]
+        cells = [str(known["num_photos"]), "", _number(percent_of(explained)), str(predicted)]
+        rows.append(["known cameras", *cells, *("" for _ in values["median"]["auc"]), ""])
+        median = values["median"]
+        fewer = predicted < _AS_MANY * median["num_predicted_matches"]
+        if fewer and explained < median["explained_share"]:
+            caption += " The known cameras explain and predict less than these models: perhaps they are off."
     header = ["seed", "photos", "points", "explained %", "predicted"]
     header += [f"AUC@{threshold}" for threshold in values["median"]["auc"]]
-    return Table(
-        header=[*header, "verdict"],
-        rows=rows,
-        caption=f"The workspace's own model is that of seed {values['seeds'][0]['seed']}.",
-    )
+    return Table(header=[*header, "verdict"], rows=rows, caption=caption)
 
 
 _PYCOLMAP_STAGES = {

@@ -58,11 +58,18 @@ def plain_prediction(neighbours: Neighbours, two: TwoViews) -> list[list[int]]:
     return sorted([i, j] for j, (_, i) in best.items())
 
 
-@pytest.mark.parametrize(("num0", "num1"), [(300, 40), (7, 300), (5, 12), (5, 3), (5, 1), (5, 0), (0, 5)])
-def test_neighbours_are_those_of_sorting_everything(num0: int, num1: int) -> None:
+@pytest.mark.parametrize("num_values", [2, 6, 256])
+@pytest.mark.parametrize(
+    ("num0", "num1"),
+    [(300, 40), (7, 300), (40, 1000), (5, 128), (5, 127), (5, 12), (5, 3), (5, 1), (5, 0), (0, 5)],
+)
+def test_neighbours_are_those_of_sorting_everything(num0: int, num1: int, num_values: int) -> None:
     generator = np.random.default_rng(0)
-    # Few values, so that many distances are equal.
-    descriptors0, descriptors1 = (generator.integers(0, 2, (n, 4), np.uint8) * 255 for n in (num0, num1))
+    # With few values many distances are equal.
+    step = 255 // (num_values - 1)
+    descriptors0, descriptors1 = (
+        generator.integers(0, num_values, (n, 4), np.uint8) * np.uint8(step) for n in (num0, num1)
+    )
     found = nearest_descriptors(descriptors0, descriptors1)
     expected = plain_neighbours(descriptors0, descriptors1, 12)
     np.testing.assert_array_equal(found.keypoints, expected.keypoints)

@@ -18,8 +18,8 @@ from typing import Any
 
 from corrsfm import config as cfg
 from corrsfm import pipeline
-from corrsfm.colmap.models import is_model, poses_of
-from corrsfm.errors import ConfigError, ReconstructionError
+from corrsfm.colmap.models import find_model, is_model, poses_of, read_model
+from corrsfm.errors import ConfigError, InputError, ReconstructionError
 from corrsfm.evaluation.scenes.evidence import common_evidence, evidence_of
 from corrsfm.evaluation.scenes.score import (
     SCENE_THRESHOLDS_DEG,
@@ -234,7 +234,8 @@ def evaluate_seeds(folder: Path, ground_truth: Path, num_seeds: int, run: cfg.Ru
     -------
     dict
         The score of its own model as of `evaluate_scene`, with ``seeds`` (`measure_seed` of each, its own
-        first), ``median`` and ``worst``.
+        first), ``median`` and ``worst``, and ``known_cameras``: what those explain and predict, None where
+        they have no intrinsics of these photos.
 
     Raises
     ------
@@ -250,7 +251,28 @@ def evaluate_seeds(folder: Path, ground_truth: Path, num_seeds: int, run: cfg.Ru
         runs += map_other_seeds(workspace, config, num_seeds)
         with common_evidence([one.workspace for one in runs], seed=config.run.seed) as evidence:
             seeds = [measure_seed(one, evidence, truth) for one in runs]
-    return {**own.to_dict(), "seeds": seeds, **summarise_seeds(seeds)}
+            known = _measure_known(ground_truth, evidence)
+    return {**own.to_dict(), "seeds": seeds, "known_cameras": known, **summarise_seeds(seeds)}
+
+
+def _measure_known(ground_truth: Path, evidence: SceneEvidence) -> dict[str, Any] | None:
+    """What the known cameras explain and predict, as a model that was not made from these matches.
+
+    None if they are poses alone, or cameras of photos of another size.
+    """
+    try:
+        known = views_of(read_model(find_model(ground_truth)))
+    except InputError:
+        return None
+    views = {name: view for name, view in known.items() if name in evidence.keypoints}
+    for name, view in views.items():
+        if (view.camera.width, view.camera.height) != evidence.features(name).image_size:
+            return None
+    return {
+        "num_photos": len(views),
+        "explained_share": evidence.explain(views).share,
+        "num_predicted_matches": evidence.count_predicted(views),
+    }
 
 
 def _config_of(workspace: Workspace, run: cfg.RunConfig) -> cfg.PipelineConfig:

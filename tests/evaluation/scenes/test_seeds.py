@@ -6,6 +6,8 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
+import pycolmap
 import pytest
 from click.testing import CliRunner, Result
 from rendered_scene import CONFIG, render_scene
@@ -13,7 +15,7 @@ from rendered_scene import CONFIG, render_scene
 from corrsfm import config as cfg
 from corrsfm import pipeline
 from corrsfm.cli import main
-from corrsfm.colmap.models import read_models
+from corrsfm.colmap.models import find_model, read_model, read_models, write_model
 from corrsfm.errors import ReconstructionError, WorkspaceError
 from corrsfm.evaluation.scenes.evidence import evidence_of
 from corrsfm.evaluation.scenes.score import evaluate_scene
@@ -82,8 +84,35 @@ def test_the_table_shows_every_seed_the_median_and_the_worst(scene: Path, made: 
     assert text.endswith("\n\n" + render_table({"kind": "scene", **values}) + "\n")
     assert f"registered          {values['num_registered']} of 4 photos" in text
     rows = [line.split(" | ")[0] for line in text.splitlines() if line.startswith("| ")]
-    assert rows == ["| seed", "| ---", "| 3", "| 4", "| median", "| worst"]
+    assert rows == ["| seed", "| ---", "| 3", "| 4", "| median", "| worst", "| known cameras"]
     assert max(len(line) for line in text.splitlines() if line.startswith("| ")) <= 100
+
+
+def test_known_cameras_are_judged_by_the_matches_too(scene: Path, made: Path, tmp_path: Path) -> None:
+    values = evaluate_seeds(scene, made / "truth", 1, CONFIG.run)
+    known = values["known_cameras"]
+    assert known["num_photos"] == 4
+    assert known["explained_share"] > 0.9
+    assert "perhaps they are off" not in render_table({"kind": "scene", **values})
+    bent = read_model(find_model(made / "truth"))
+    for image in bent.images.values():
+        if image.image_id % 2:
+            turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([0.0, 0.0, 0.3])), np.zeros(3))
+            bent.frame(image.frame_id).rig_from_world = turn * image.cam_from_world()
+    write_model(bent, tmp_path / "bent")
+    values = evaluate_seeds(scene, tmp_path / "bent", 1, CONFIG.run)
+    assert values["known_cameras"]["explained_share"] < 0.5
+    assert "perhaps they are off" in render_table({"kind": "scene", **values})
+
+
+def test_known_cameras_of_photos_of_another_size_are_not_judged(
+    scene: Path, made: Path, tmp_path: Path
+) -> None:
+    other = read_model(find_model(made / "truth"))
+    for camera in other.cameras.values():
+        camera.width *= 2
+    write_model(other, tmp_path / "other")
+    assert evaluate_seeds(scene, tmp_path / "other", 1, CONFIG.run)["known_cameras"] is None
 
 
 def test_finished_seeds_are_kept_and_a_killed_one_goes_on(
