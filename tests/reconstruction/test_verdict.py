@@ -80,7 +80,7 @@ def test_a_model_that_explains_a_part_of_every_pair_is_doubtful_although_no_pair
         ({"is_folded": True, "conflicts": ["a – b"]}, Grade.WRONG, "(such as a – b)"),
         ({"thickness": 0.0}, Grade.DOUBTFUL, "one plane"),
         ({"focal_slack": FocalSlack(factor=1.02, pose_change_deg=1.4)}, Grade.DOUBTFUL, "2 % longer"),
-        ({"focal_slack": FocalSlack(factor=1.2, pose_change_deg=0.1)}, Grade.DOUBTFUL, "20 % longer"),
+        ({"focal_slack": FocalSlack(factor=1.2, pose_change_deg=0.7)}, Grade.DOUBTFUL, "20 % longer"),
     ],
 )
 def test_each_evidence_alone_lowers_the_grade(change: dict, grade: Grade, words: str) -> None:
@@ -98,7 +98,8 @@ def test_each_evidence_alone_lowers_the_grade(change: dict, grade: Grade, words:
         {"is_folded": None},
         {"thickness": None},
         {"focal_slack": None},
-        {"focal_slack": FocalSlack(factor=1.03, pose_change_deg=0.4)},
+        {"focal_slack": FocalSlack(factor=1.03, pose_change_deg=0.9)},
+        {"focal_slack": FocalSlack(factor=1.2, pose_change_deg=0.5)},
         {"thickness": math.nan},
         {"thickness": 0.0, "has_prior_focal_lengths": True},
         {"support": None},
