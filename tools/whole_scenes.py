@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from corrsfm.errors import InputError
+from corrsfm.errors import CorrsfmError
 from corrsfm.evaluation.records import provenance, save_results
 from corrsfm.evaluation.scenes.score import evaluate_scene, read_poses
 
@@ -181,7 +181,7 @@ def measure(model: Path, scene: Path, seed: int) -> dict[str, Any]:
     verdict = json.loads(evidence.read_text(encoding="utf-8")).get("verdict", {}) if evidence.exists() else {}
     try:
         score = evaluate_scene(model, scene)
-    except InputError:
+    except CorrsfmError:
         auc5, num_registered, num_photos = 0.0, 0, len(read_poses(scene))
     else:
         auc5, num_registered, num_photos = score.auc["5"], score.num_registered, score.num_photos

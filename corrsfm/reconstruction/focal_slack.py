@@ -25,8 +25,8 @@ from corrsfm.reconstruction.views import views_of
 __all__ = ["FocalSlack", "measure_focal_slack"]
 
 # Right models of training, validation and sample scenes have 1.07 and 1.1° at most, but for two flights over
-# flat ground, and for three objects seen through long lenses: 1.10 to 1.18, which moves their cameras by 0.4 to
-# 0.5° only.
+# flat ground, and for three objects seen through long lenses: 1.10 to 1.18, which moves their cameras by 0.4
+# to 0.5° only.
 _LARGEST_FACTOR, _LARGEST_POSE_CHANGE_DEG = 1.08, 1.2
 _POSE_CHANGE_OF_OPEN_DEG = 0.6
 

@@ -95,3 +95,14 @@ def test_mapping_on_from_there_has_a_bound(tmp_path: Path, monkeypatch: pytest.M
         assert register_again(truth, [name], tmp_path / "database.db", tmp_path / "work", **given) is None
     assert bounds[0] <= 0 and bounds[1] == 7
     assert not (tmp_path / "work").exists()
+
+
+def test_a_camera_that_cannot_be_is_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bundle adjustment may take a focal length through zero where a photo hangs on false matches."""
+    truth = synthesize(tmp_path / "database.db")
+    impossible = pycolmap.Reconstruction(truth)
+    camera = next(iter(impossible.cameras.values()))
+    camera.params = [-14.2, *camera.params[1:]]
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_, **__: {0: impossible})
+    name = next(iter(views_of(truth)))
+    assert register_again(truth, [name], tmp_path / "database.db", tmp_path / "work") is None
