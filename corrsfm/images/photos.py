@@ -141,8 +141,7 @@ def read_small(path: Path, max_size: int) -> tuple[NDArray[np.uint8], float]:
     advice, kind = "re-export or remove the photo", cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     reduced = 1
     if path.suffix.lower() in (".jpg", ".jpeg"):
-        with _opened(path, advice) as file:
-            longest = max(declared_size(file) or (0, 0))
+        longest = max(stored_size(path) or (0, 0))
         # libjpeg leaves out what a smaller picture does not need.
         for factor, reduced_kind in _REDUCED_KINDS.items():
             if longest >= factor * max_size:

@@ -40,6 +40,7 @@ __all__ = [
     "find_cameras_on_trial",
     "has_unknown_focal_lengths",
     "incremental_options",
+    "largest_possible",
     "map_candidate",
 ]
 
@@ -202,8 +203,7 @@ def map_candidate(
         models = {} if prepared is None else _map(
             candidate, prepared, scratch, refinement, num_threads, max_runtime_seconds
         )  # fmt: skip
-        possible = [one for one in models.values() if has_possible_cameras(one)]
-        model = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
+        model = largest_possible(models.values())
         if model is not None and model.num_reg_images() > 1:
             restore_priors(model, own)
             write_model(model, workdir / "model")
@@ -215,6 +215,12 @@ def map_candidate(
     # Last: its presence says that the candidate is finished.
     finished.write_text(json.dumps({"name": candidate.name, "seconds": time.monotonic() - started}))
     return model
+
+
+def largest_possible(models: Iterable[pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+    """The model of most photos, then points, among those whose cameras can be; None if there is none."""
+    possible = [model for model in models if has_possible_cameras(model)]
+    return max(possible, key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
 def _prepare_database(candidate: Candidate, database: Path, workdir: Path) -> Path | None:

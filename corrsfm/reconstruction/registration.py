@@ -15,18 +15,14 @@ import pycolmap
 from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.models import write_model
 from corrsfm.colmap.sqlite import copy_database, database_errors
-from corrsfm.reconstruction.calibration import (
-    DEFAULT_REFINEMENT,
-    Refinement,
-    has_possible_cameras,
-    restore_priors,
-)
+from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement, restore_priors
 from corrsfm.reconstruction.candidates import (
     Candidate,
     MapperKind,
     StartingCameras,
     change_cameras,
     incremental_options,
+    largest_possible,
 )
 
 __all__ = ["register_again"]
@@ -104,8 +100,7 @@ def register_again(
         pycolmap.set_random_seed(seed)
         models = pycolmap.incremental_mapping(database, workdir, found, options, input_path=given)
     shutil.rmtree(workdir)
-    possible = [one for one in models.values() if has_possible_cameras(one)]
-    again = max(possible, key=lambda one: (one.num_reg_images(), one.num_points3D()), default=None)
+    again = largest_possible(models.values())
     kept = {image.name for image in rest.images.values() if image.has_pose}
     if again is None or not kept <= {image.name for image in again.images.values() if image.has_pose}:
         return None
