@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import html
 import math
-import statistics
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from corrsfm.evaluation.records import load_results, provenance, save_results
-from corrsfm.evaluation.tables import Table
+from corrsfm.evaluation.tables import Table, median_and_worst_of
 
 __all__ = ["HOUSE_TABLES", "draw_growth", "keep_row"]
 
@@ -100,7 +99,10 @@ def _folds_table(values: dict[str, Any]) -> Table:
                 scene,
                 str(runs[0]["num_photos"]),
                 *(f"{number} of {len(runs)}" for number in (unfolded, folded)),
-                *(_median_and_worst(auc) for auc in (map(_auc_without, runs), (run["auc5"] for run in runs))),
+                *(
+                    median_and_worst_of(auc)
+                    for auc in (map(_auc_without, runs), (run["auc5"] for run in runs))
+                ),
             ]
         )
     caption = (
@@ -112,11 +114,6 @@ def _folds_table(values: dict[str, Any]) -> Table:
 
 def _auc_without(run: dict[str, Any]) -> float:
     return float(run.get("without", run)["auc5"])
-
-
-def _median_and_worst(numbers: Iterable[float]) -> str:
-    numbers = list(numbers)
-    return f"{statistics.median(numbers):.1f} ({min(numbers):.1f})"
 
 
 def _machine(values: dict[str, Any]) -> str:

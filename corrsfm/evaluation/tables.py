@@ -8,13 +8,21 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from corrsfm.errors import InputError
 
-__all__ = ["Table", "build_table", "grades_text", "median_and_worst", "percent_of", "render_table"]
+__all__ = [
+    "Table",
+    "build_table",
+    "grades_text",
+    "median_and_worst",
+    "median_and_worst_of",
+    "percent_of",
+    "render_table",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,6 +189,12 @@ def _compare_seeds_table(values: dict[str, Any], num_seeds: int) -> Table:
 _AS_MANY = 0.9
 
 
+def median_and_worst_of(numbers: Iterable[float]) -> str:
+    """Numbers of several runs, of which more is better, as "median (worst)"."""
+    numbers = list(numbers)
+    return f"{statistics.median(numbers):.1f} ({min(numbers):.1f})"
+
+
 def percent_of(share: float) -> float:
     """A share in percent, rounded down to a tenth as in verdicts: 99.97 % is not everything."""
     return math.floor(1000.0 * share) / 10.0
@@ -313,7 +327,7 @@ def _median_score(runs: list[dict[str, Any]]) -> float:
 
 def _runs_cell(runs: list[dict[str, Any]], num_seeds: int) -> str:
     """Median and worst score, and the photos and runs if some are missing."""
-    text = f"{_median_score(runs):.1f} ({min(run['auc5'] for run in runs):.1f})"
+    text = median_and_worst_of(run["auc5"] for run in runs)
     registered, photos = min(run["num_registered"] for run in runs), runs[0]["num_photos"]
     if registered < photos:
         text += f", {registered}/{photos}"
