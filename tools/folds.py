@@ -39,6 +39,7 @@ def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
     folds = evidence.get("folds", {})
     names = [model["name"] for model in evidence.get("models_tried", []) if model["chosen"]]
     row |= {
+        "chosen": names[0] if names else None,
         "unfolded_by": next((name for name in names if name.startswith("unfolded")), None),
         "still_folded": folds.get("folded"),
         "num_near_pairs": folds.get("num_near_pairs"),

@@ -11,8 +11,8 @@
     ├── views.py         a model's cameras and poses; epipolar.py and agreement.py compare two
     ├── explained.py     the verified matches that a model explains
     ├── predicted.py     the matches that a model predicts
-    ├── registration.py  photos in the wrong place, registered again
-    ├── folds/           models folded by repeated structure
+    ├── mending.py       parts.py puts parts in their place, registration.py registers photos again
+    ├── folds/           models folded by repeated structure; unfolding.py maps them without some pairs
     ├── verdict.py       good, doubtful or wrong; record.py keeps why
     ├── calibration.py   implausible focal lengths, and adjusting a model
     ├── lens.py          what a richer lens model would gain; focal_slack.py what other focal lengths cost

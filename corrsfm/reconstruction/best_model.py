@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import shutil
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,8 +11,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from corrsfm.colmap.log import colmap_log
-from corrsfm.colmap.sqlite import copy_database, database_errors
 from corrsfm.reconstruction.budget import TimeBudget
 from corrsfm.reconstruction.calibration import (
     DEFAULT_REFINEMENT,
@@ -27,23 +24,17 @@ from corrsfm.reconstruction.candidates import (
     StartingCameras,
     candidate_bank,
     has_unknown_focal_lengths,
-    map_candidate,
 )
 from corrsfm.reconstruction.choice import Choice, ChoicePolicy, Tried, choose_model
 from corrsfm.reconstruction.explained import explain
 from corrsfm.reconstruction.focal_slack import measure_focal_slack
 from corrsfm.reconstruction.folds.evidence import FoldEvidence
-from corrsfm.reconstruction.folds.unfold import (
-    Attempt,
-    UnfoldRule,
-    best_unfolding,
-    judge_model,
-    try_unfolding,
-)
+from corrsfm.reconstruction.folds.unfold import Attempt, judge_model
 from corrsfm.reconstruction.lens import measure_lens_misfit
+from corrsfm.reconstruction.mending import Mender
 from corrsfm.reconstruction.pool import CandidatePool
-from corrsfm.reconstruction.registration import register_again
 from corrsfm.reconstruction.scene_evidence import SceneEvidence
+from corrsfm.reconstruction.unfolding import unfold_model
 from corrsfm.reconstruction.verdict import Evidence, Verdict, judge, thickness
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair
@@ -135,6 +126,7 @@ def select_model(
         If the database cannot be read.
     """
     models: dict[str, pycolmap.Reconstruction] = {}
+    left_out: dict[str, tuple[Pair, ...]] = {}
 
     def tried(
         name: str,
@@ -185,24 +177,22 @@ def select_model(
                 for one, model in zip(candidates, found, strict=True)
             ]
 
-        def mend(model: Tried) -> Tried | None:
+        mender = Mender(evidence, database, workdir / "again", seed=seed, refinement=refinement)
+
+        def mend(model: Tried, *, parts_only: bool = False) -> Tried | None:
             if not budget.seconds_left:
                 return None
             with budget.spent() as spent:
-                again = register_again(
+                again = (mender.put_parts if parts_only else mender.mend)(
                     models[model.name],
-                    model.explained.misplaced,
-                    database,
-                    workdir / "again",
+                    model.explained,
                     cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
-                    seed=seed,
-                    refinement=refinement,
                     max_runtime_seconds=budget.seconds_left,
                 )
             if again is None:
                 return None
             name = model.name + _MENDED
-            # It may have photos to register once more.
+            # It may have more to mend.
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
             return tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
 
@@ -221,13 +211,21 @@ def select_model(
             others = [outcome for outcome in others if outcome is not start]
         if start is None:
             return None
+        if policy.max_models > 1 and (again := mend(start, parts_only=True)) is not None:
+            start, others = again, [start, *others]
         attempt = judge_model(models[start.name], evidence.verified)
         if unfold:
             with budget.spent():
                 part = TimeBudget(_SHARE_TO_UNFOLD * budget.seconds_left)
-                best = _unfolded(attempt, evidence, database, workdir, seed, refinement, part)
+                best = unfold_model(attempt, evidence, database, workdir, seed, refinement, part)
             if best is not attempt:
-                return _selection_of(best, start, evidence, first_seconds)
+                selection = _selection_of(best, start, evidence, first_seconds)
+                explained = selection.choice.chosen.explained
+                if explained.is_enough(explained.share) or explained.is_enough_of_supported:
+                    return selection
+                # Whatever it was, it was more than a fold.
+                others = [*others, tried(selection.choice.chosen.name, best.model, first_seconds)]
+                left_out[selection.choice.chosen.name] = best.removed
         choice = choose_model(
             start,
             bank,
@@ -246,6 +244,7 @@ def select_model(
         choice=choice,
         verdict=_verdict(model, choice, len(evidence.names), attempt.evidence),
         folds=attempt.evidence,
+        left_out=left_out.get(choice.chosen.name, ()),
         cameras=cameras_of.get(choice.chosen.name, StartingCameras.AS_IS),
     )
 
@@ -260,59 +259,6 @@ def _are_mostly_of_one_size(model: pycolmap.Reconstruction) -> bool:
     cameras = [image.camera for image in model.images.values() if image.has_pose]
     sizes = Counter((one.width, one.height) for one in cameras if not one.has_prior_focal_length)
     return 2 * max(sizes.values(), default=0) >= len(cameras)
-
-
-def _unfolded(
-    first: Attempt,
-    evidence: SceneEvidence,
-    database: Path,
-    workdir: Path,
-    seed: int,
-    refinement: Refinement,
-    budget: TimeBudget,
-) -> Attempt:
-    """The best model without pairs that fold the first one; or the first one.
-
-    Parts that only chance joins are looked for in any case: there, evidence of a fold may be too little.
-    """
-
-    def map_without(removed: Sequence[Pair]) -> pycolmap.Reconstruction | None:
-        if not budget.seconds_left:
-            return None
-        with budget.spent():
-            folder = workdir / "unfolded"
-            return _map_without(removed, database, folder, seed, refinement, budget.seconds_left)
-
-    attempts = try_unfolding(
-        first,
-        evidence.verified,
-        map_without,
-        rules=tuple(UnfoldRule) if first.evidence.folded else (UnfoldRule.VOTES,),
-    )
-    return best_unfolding(first, attempts)
-
-
-def _map_without(
-    removed: Sequence[Pair],
-    database: Path,
-    workdir: Path,
-    seed: int,
-    refinement: Refinement,
-    max_runtime_seconds: int,
-) -> pycolmap.Reconstruction | None:
-    """The model of the verified pairs without some of them."""
-    shutil.rmtree(workdir, ignore_errors=True)
-    workdir.mkdir(parents=True)
-    copy = workdir / "database.db"
-    copy_database(database, copy)
-    with colmap_log(), database_errors(copy), pycolmap.Database.open(copy) as tables:
-        ids = {image.name: image.image_id for image in tables.read_all_images()}
-        for name0, name1 in removed:
-            tables.delete_two_view_geometry(ids[name0], ids[name1])
-    candidate = Candidate(mapper=MapperKind.INCREMENTAL, seed=seed)
-    return map_candidate(
-        candidate, copy, workdir / "model", refinement=refinement, max_runtime_seconds=max_runtime_seconds
-    )
 
 
 def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first_seconds: float) -> Selection:

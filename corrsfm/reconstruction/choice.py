@@ -175,9 +175,8 @@ def choose_model(
     others : sequence of Tried or None
         Candidates that have been mapped already.
     mend : callable, optional
-        Registers the misplaced photos of a model again (`corrsfm.reconstruction.registration`); None if that
-        gave nothing. Asked once about every model that is the best at the end of a round; what it returns is
-        one more model to choose from.
+        Mends a model (`corrsfm.reconstruction.mending`); None if that gave nothing. Asked once about every
+        model that is the best at the end of a round; what it returns is one more model to choose from.
 
     Returns
     -------
@@ -185,7 +184,8 @@ def choose_model(
         Of equal models the earlier is taken, so the first one stays unless another is better.
     """
     if good_enough(first, num_photos, policy):
-        return Choice(chosen=first, tried=(first,), reason="the first model is good enough")
+        known = (first, *(model for model in others if model is not None))
+        return Choice(chosen=first, tried=known, reason="the first model is good enough")
     if not bank or policy.max_models < 2:
         return Choice(chosen=first, tried=(first,), reason="no other candidate was to be tried")
 
@@ -196,7 +196,7 @@ def choose_model(
 
     def mend_best(outcomes: list[Tried | None]) -> None:
         best = _best([model for model in outcomes if model is not None])
-        if best.explained.misplaced and best.name not in mended:
+        if best.name not in mended:
             mended.add(best.name)
             again = mend(best)
             if again is not None:

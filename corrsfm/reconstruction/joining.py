@@ -29,13 +29,13 @@ from corrsfm.reconstruction.calibration import (
 )
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.resection import Landmarks
-from corrsfm.reconstruction.same_points import candidates_of, observed, registered_images
+from corrsfm.reconstruction.same_points import Candidates, candidates_of, observed, registered_images
 from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.similarity import Similarity, find_similarity
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair
 
-__all__ = ["Joining", "join_models"]
+__all__ = ["FEWEST_POINTS", "Joining", "Placement", "find_placements", "join_models", "merge_models"]
 
 FEWEST_POINTS = 15
 """Points that must agree with one similarity. By chance up to 8 do."""
@@ -44,6 +44,21 @@ _MAX_ATTEMPTS = 12
 # Adjusting the whole moves a few matches over a threshold.
 _LEAST_EXPLAINED, _LEAST_PREDICTED = 0.99, 0.97
 _LEAST_ACROSS = 0.5
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placement:
+    """How two models may lie to one another.
+
+    Attributes
+    ----------
+    a_from_b : Similarity
+    same_points : list of (int, int)
+        Distinct points of a and of b that agree with it and so would be the same.
+    """
+
+    a_from_b: Similarity
+    same_points: list[tuple[int, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,6 +168,39 @@ def join_models(
     return left, attempts
 
 
+def find_placements(
+    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, candidates: Candidates, *, num: int, seed: int = 0
+) -> list[Placement]:
+    """Similarities between two models that most of what may be the same point agrees with.
+
+    Parameters
+    ----------
+    a, b : pycolmap.Reconstruction
+    candidates : Candidates
+        Of the two.
+    num : int
+        Placements at most. The second is what most of those say that disagree with the first, and so on.
+    seed : int
+
+    Returns
+    -------
+    list of Placement
+        Not necessarily with many points.
+    """
+    longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
+    max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
+    placements: list[Placement] = []
+    while len(placements) < num:
+        side_a, side_b = (observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
+        found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
+        if found is None:
+            break
+        a_from_b, agreeing = found
+        placements.append(Placement(a_from_b=a_from_b, same_points=candidates.same_points(agreeing)))
+        candidates = Candidates(a=candidates.a[~agreeing], b=candidates.b[~agreeing])
+    return placements
+
+
 def _join(
     a: pycolmap.Reconstruction,
     b: pycolmap.Reconstruction,
@@ -162,43 +210,70 @@ def _join(
     seed: int,
 ) -> tuple[pycolmap.Reconstruction | None, Joining]:
     candidates = candidates_of(a, b, database, evidence.features)
-    side_a, side_b = (observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
-    longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
-    max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
-    found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
-    agreeing = np.zeros(len(side_a), np.bool_) if found is None else found[1]
-    same = candidates.same_points(agreeing)
+    placements = find_placements(a, b, candidates, num=1, seed=seed)
+    num_points = max((len(one.same_points) for one in placements), default=0)
 
     def outcome(reason: str, joined: bool = False) -> Joining:
         return Joining(
             photos0=Landmarks(a).photos,
             photos1=Landmarks(b).photos,
             is_joined=joined,
-            num_candidates=len(candidates.same_points(np.ones(len(side_a), np.bool_))),
-            num_points=len(same),
+            num_candidates=len(candidates.same_points(np.ones(len(candidates.a), np.bool_))),
+            num_points=num_points,
             reason=reason,
         )
 
-    if found is None or len(same) < FEWEST_POINTS:
+    if num_points < FEWEST_POINTS:
         return None, outcome(
-            f"{len(same)} points agree on how they lie to one another, {FEWEST_POINTS} are needed: photos "
+            f"{num_points} points agree on how they lie to one another, {FEWEST_POINTS} are needed: photos "
             "that show what both show would join them"
         )
-    joined = _merged(a, b, found[0], same, database, seed)
-    refine(joined, options)
-    if _merge_predicted(joined, _across(a, b, evidence.predicted(views_of(joined)))):
-        refine(joined, options)
+    joined = merge_models(a, b, placements[0], database, evidence, options=options, seed=seed)
     objection = _objection(a, b, joined, evidence)
     if objection:
-        return None, outcome(f"{len(same)} points agree on how they lie to one another, but {objection}")
-    return joined, outcome(f"{len(same)} points agree on how they lie to one another", joined=True)
+        return None, outcome(f"{num_points} points agree on how they lie to one another, but {objection}")
+    return joined, outcome(f"{num_points} points agree on how they lie to one another", joined=True)
+
+
+def merge_models(
+    a: pycolmap.Reconstruction,
+    b: pycolmap.Reconstruction,
+    placement: Placement,
+    database: Path,
+    evidence: SceneEvidence,
+    *,
+    options: pycolmap.BundleAdjustmentOptions,
+    seed: int = 0,
+) -> pycolmap.Reconstruction:
+    """One adjusted model of two, held together by the same points and by the matches that it predicts.
+
+    Parameters
+    ----------
+    a, b : pycolmap.Reconstruction
+        Not changed.
+    placement : Placement
+    database : Path
+        That they were mapped from; not changed.
+    evidence : SceneEvidence
+    options : pycolmap.BundleAdjustmentOptions
+    seed : int
+
+    Returns
+    -------
+    pycolmap.Reconstruction
+        In the frame of a.
+    """
+    merged = _merged(a, b, placement, database, seed)
+    refine(merged, options)
+    if _merge_predicted(merged, _across(a, b, evidence.predicted(views_of(merged)))):
+        refine(merged, options)
+    return merged
 
 
 def _merged(
     a: pycolmap.Reconstruction,
     b: pycolmap.Reconstruction,
-    a_from_b: Similarity,
-    same: Sequence[tuple[int, int]],
+    placement: Placement,
     database: Path,
     seed: int,
 ) -> pycolmap.Reconstruction:
@@ -206,6 +281,7 @@ def _merged(
     merged = pycolmap.Reconstruction(a)
     in_a, in_b = registered_images(a), registered_images(b)
     moved = pycolmap.Reconstruction(b)
+    a_from_b = placement.a_from_b
     moved.transform(
         pycolmap.Sim3d(a_from_b.scale, pycolmap.Rotation3d(a_from_b.rotation), a_from_b.translation)
     )
@@ -221,7 +297,8 @@ def _merged(
                 merged.cameras[image.camera_id].params = list(moved.cameras[source.camera_id].params)
             merged.frames[image.frame_id].set_cam_from_world(image.camera_id, source.cam_from_world())
             merged.register_frame(image.frame_id)
-        _add_points(mapper, merged, moved, set(new), {point_b: point_a for point_a, point_b in same})
+        point_in_a = {point_b: point_a for point_a, point_b in placement.same_points}
+        _add_points(mapper, merged, moved, set(new), point_in_a)
         options = pycolmap.IncrementalTriangulatorOptions()
         options.random_seed = seed
         mapper.complete_and_merge_tracks(options)

@@ -1,0 +1,228 @@
+"""Parts of a model that few matches hold together, taken apart and put together again.
+
+Incremental mapping takes the first pair that carries a part across to the next. Where the scene looks alike
+from two sides, that pair may be a false one, and the part then stays where a few dozen false matches put it:
+the true pairs across each say where it belongs, but none of them alone is strong enough. So each part is
+taken as a model of its own, and all that may be the same point in both, from matches of every pair and from
+the look of the points, decides together how they lie to one another.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from corrsfm.reconstruction.calibration import (
+    DEFAULT_REFINEMENT,
+    Refinement,
+    adjustment_options,
+    has_possible_cameras,
+)
+from corrsfm.reconstruction.explained import Explained
+from corrsfm.reconstruction.folds.unfold import judge_model
+from corrsfm.reconstruction.joining import Placement, find_placements, merge_models
+from corrsfm.reconstruction.same_points import candidates_of
+from corrsfm.reconstruction.scene_evidence import SceneEvidence
+from corrsfm.reconstruction.views import Views, views_of
+from corrsfm.types import Pair
+
+__all__ = ["WeakLink", "put_together_again", "weak_links"]
+
+# No right model of 38 training and validation scenes has parts of three photos that hang by so little.
+_WEAK_STRENGTH = 0.3
+_FEWEST_PHOTOS = 3
+# By chance up to 8 points agree; what is made of them is looked at again.
+_FEWEST_POINTS = 10
+_MAX_LINKS, _MAX_PLACEMENTS = 4, 3
+_LEAST_PHOTOS = 0.5
+_SAME_TURN_DEG, _SAME_PLACE = 10.0, 0.1
+# Verified matches were selected by geometries of which some are false; those that the model predicts across
+# were not, and where the parts are right they more than double.
+_LEAST_EXPLAINED, _LEAST_ACROSS = 0.98, 1.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeakLink:
+    """Two parts of a model, and how strongly they are linked.
+
+    Attributes
+    ----------
+    part0, part1 : tuple of str
+        Photos, sorted; the larger part first.
+    strength : float
+        Explained matches of the strongest pair across, over those of the second-strongest pair of the photo
+        of it that has fewer.
+    """
+
+    part0: tuple[str, ...]
+    part1: tuple[str, ...]
+    strength: float
+
+
+def weak_links(explained: Explained) -> list[WeakLink]:
+    """Parts of three photos or more that no pair holds together as its photos are held by others.
+
+    Photos that hang by even less are in neither part.
+
+    Returns
+    -------
+    list of WeakLink
+        The weakest first.
+    """
+    held: dict[Pair, int] = {}
+    counts: dict[str, list[int]] = defaultdict(list)
+    for one in explained.pairs:
+        if one.is_registered and one.num_verified:
+            counts[one.name0].append(one.num_verified)
+            counts[one.name1].append(one.num_verified)
+            if not one.is_contradicted:
+                held[one.name0, one.name1] = one.num_explained
+    second = {name: sorted(numbers)[-2] if len(numbers) > 1 else 0 for name, numbers in counts.items()}
+    strength = {
+        pair: num / least if (least := min(second[pair[0]], second[pair[1]])) else np.inf
+        for pair, num in held.items()
+    }
+    parts = {name: [name] for name in counts}
+    links = []
+    # From the strongest pair down, as the greatest spanning tree is built.
+    for pair in sorted(held, key=lambda one: (-strength[one], one)):
+        part0, part1 = parts[pair[0]], parts[pair[1]]
+        if part0 is part1:
+            continue
+        if strength[pair] < _WEAK_STRENGTH:
+            links += _link(part0, part1, strength[pair])
+        _unite(parts, part0, part1)
+    # What no pair holds together, as every pair across is contradicted.
+    apart = sorted({id(part): part for part in parts.values()}.values(), key=lambda part: (-len(part), part))
+    for part in apart[1:]:
+        links += _link(apart[0], part, 0.0)
+        _unite(parts, apart[0], part)
+    return links[::-1]
+
+
+def _link(part0: list[str], part1: list[str], strength: float) -> list[WeakLink]:
+    """One link, or none if a part is too small to be a model of its own."""
+    if min(len(part0), len(part1)) < _FEWEST_PHOTOS:
+        return []
+    larger, smaller = sorted((sorted(part0), sorted(part1)), key=lambda part: (-len(part), part))
+    return [WeakLink(part0=tuple(larger), part1=tuple(smaller), strength=strength)]
+
+
+def _unite(parts: dict[str, list[str]], part0: list[str], part1: list[str]) -> None:
+    part0 += part1
+    for name in part1:
+        parts[name] = part0
+
+
+def put_together_again(
+    model: pycolmap.Reconstruction,
+    explained: Explained,
+    database: Path,
+    evidence: SceneEvidence,
+    *,
+    seed: int = 0,
+    refinement: Refinement = DEFAULT_REFINEMENT,
+) -> pycolmap.Reconstruction | None:
+    """Take a model apart where it hangs by little, and put the parts where most points say.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        Not changed.
+    explained : Explained
+        What it explains.
+    database : Path
+        That it was mapped from; not changed.
+    evidence : SceneEvidence
+    seed : int
+    refinement : Refinement
+        What may change of the cameras when the new model is adjusted.
+
+    Returns
+    -------
+    pycolmap.Reconstruction or None
+        None if no part hangs by little, or all points agree with where they are, or the other place explains
+        less, predicts not clearly more across, or is a fold. Photos that hang by even less are left out, up
+        to half of all.
+
+    Raises
+    ------
+    DatabaseError
+        If the database cannot be read.
+    """
+    options = adjustment_options(refinement, num_threads=1)
+    moved: list[pycolmap.Reconstruction] = []
+    # Parts of parts first.
+    for link in weak_links(explained)[:_MAX_LINKS][::-1]:
+        a, b = (_moved_or_as_is(part, moved, model) for part in (link.part0, link.part1))
+        stayed = not any(one is a or one is b for one in moved)
+        candidates = candidates_of(a, b, database, evidence.features)
+        for placement in find_placements(a, b, candidates, num=_MAX_PLACEMENTS, seed=seed):
+            if len(placement.same_points) < _FEWEST_POINTS or (stayed and _is_as_before(placement, a, b)):
+                continue
+            again = merge_models(a, b, placement, database, evidence, options=options, seed=seed)
+            if _is_better(again, model, link, evidence):
+                moved = [one for one in moved if one is not a and one is not b] + [again]
+                break
+    largest = max(moved, key=lambda one: one.num_reg_images(), default=None)
+    enough = _LEAST_PHOTOS * model.num_reg_images()
+    return None if largest is None or largest.num_reg_images() < enough else largest
+
+
+def _moved_or_as_is(
+    names: tuple[str, ...], moved: list[pycolmap.Reconstruction], model: pycolmap.Reconstruction
+) -> pycolmap.Reconstruction:
+    """The largest model of photos of a part that has been put together again, or the part as it was."""
+    inside = [one for one in moved if views_of(one).keys() <= set(names)]
+    return max(inside, key=lambda one: one.num_reg_images(), default=None) or _part(model, names)
+
+
+def _part(model: pycolmap.Reconstruction, names: tuple[str, ...]) -> pycolmap.Reconstruction:
+    part = pycolmap.Reconstruction(model)
+    for image in list(part.images.values()):
+        if image.has_pose and image.name not in names:
+            part.deregister_frame(image.frame_id)
+    return part
+
+
+def _is_as_before(placement: Placement, a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> bool:
+    """Whether a placement hardly turns part b, nor moves its photos by much of the extent of both."""
+    a_from_b = placement.a_from_b
+    turn = np.degrees(np.arccos(np.clip((np.trace(a_from_b.rotation) - 1) / 2, -1, 1)))
+    centres = _centres(b)
+    distances = np.linalg.norm(a_from_b.apply(centres) - centres, axis=1)
+    extent = np.linalg.norm(np.ptp(np.vstack([_centres(a), centres]), axis=0))
+    return bool(turn < _SAME_TURN_DEG and distances.max() <= _SAME_PLACE * extent)
+
+
+def _centres(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
+    return np.array([image.projection_center() for image in model.images.values() if image.has_pose])
+
+
+def _is_better(
+    again: pycolmap.Reconstruction, model: pycolmap.Reconstruction, link: WeakLink, evidence: SceneEvidence
+) -> bool:
+    """Whether the joined parts explain what they did, predict clearly more across, and are no fold."""
+    views = views_of(again)
+    views_before = views_of(_part(model, tuple(views)))
+    if views.keys() != views_before.keys() or not has_possible_cameras(again):
+        return False
+    explained, explained_before = (evidence.explain(one).num_explained for one in (views, views_before))
+    if explained < _LEAST_EXPLAINED * explained_before:
+        return False
+    across, across_before = (_predicted_across(one, link, evidence) for one in (views, views_before))
+    if sum(map(len, across.values())) < _LEAST_ACROSS * sum(map(len, across_before.values())):
+        return False
+    # A fold predicts much across, too: it is betrayed by what photos side by side do not share. That pairs
+    # across are not verified is no sign of one; what counts is what the joined model finds.
+    return not judge_model(again, {**across, **evidence.verified}).evidence.folded
+
+
+def _predicted_across(views: Views, link: WeakLink, evidence: SceneEvidence) -> dict[Pair, NDArray[np.int32]]:
+    predicted = evidence.predicted(views)
+    return {pair: m for pair, m in predicted.items() if (pair[0] in link.part0) != (pair[1] in link.part0)}
