@@ -10,6 +10,7 @@ the look of the points, decides together how they lie to one another.
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,9 +42,10 @@ _FEWEST_POINTS = 10
 _MAX_LINKS, _MAX_PLACEMENTS = 4, 3
 _LEAST_PHOTOS = 0.5
 _SAME_TURN_DEG, _SAME_PLACE = 10.0, 0.1
-# Verified matches were selected by geometries of which some are false; those that the model predicts across
-# were not, and where the parts are right they more than double.
-_LEAST_EXPLAINED, _LEAST_ACROSS = 0.98, 1.5
+# A place that explains half of the verified matches across may be right. They were selected by geometries of
+# which some are false, so the right place may explain fewer than a wrong one; but it predicts far more.
+_ENOUGH_ACROSS = 0.5
+_LEAST_EXPLAINED_WITHIN, _LEAST_EXPLAINED_ACROSS, _LEAST_PREDICTED_ACROSS = 0.98, 0.6, 1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +64,11 @@ class WeakLink:
     part0: tuple[str, ...]
     part1: tuple[str, ...]
     strength: float
+
+    def connects(self, name0: str, name1: str) -> bool:
+        """Whether one photo is of the one part and one of the other."""
+        first, second = ({name0, name1} & set(part) for part in (self.part0, self.part1))
+        return len(first) == len(second) == 1
 
 
 def weak_links(explained: Explained) -> list[WeakLink]:
@@ -146,9 +153,9 @@ def put_together_again(
     Returns
     -------
     pycolmap.Reconstruction or None
-        None if no part hangs by little, or all points agree with where they are, or the other place explains
-        less, predicts not clearly more across, or is a fold. Photos that hang by even less are left out, up
-        to half of all.
+        None if no part hangs by little, or each is where most verified matches or most points say, or another
+        place explains less, predicts not clearly more across, or is a fold. Photos that hang by even less are
+        left out, up to half of all.
 
     Raises
     ------
@@ -161,6 +168,8 @@ def put_together_again(
     for link in weak_links(explained)[:_MAX_LINKS][::-1]:
         a, b = (_moved_or_as_is(part, moved, model) for part in (link.part0, link.part1))
         stayed = not any(one is a or one is b for one in moved)
+        if stayed and _across(explained, link).is_enough:
+            continue
         candidates = candidates_of(a, b, database, evidence.features)
         for placement in find_placements(a, b, candidates, num=_MAX_PLACEMENTS, seed=seed):
             if len(placement.same_points) < _FEWEST_POINTS or (stayed and _is_as_before(placement, a, b)):
@@ -212,17 +221,43 @@ def _is_better(
     views_before = views_of(_part(model, tuple(views)))
     if views.keys() != views_before.keys() or not has_possible_cameras(again):
         return False
-    explained, explained_before = (evidence.explain(one).num_explained for one in (views, views_before))
-    if explained < _LEAST_EXPLAINED * explained_before:
+    explained, before = (evidence.explain(one) for one in (views, views_before))
+    across, across_before = (_across(one, link).num_explained for one in (explained, before))
+    within, within_before = explained.num_explained - across, before.num_explained - across_before
+    if within < _LEAST_EXPLAINED_WITHIN * within_before or across < _LEAST_EXPLAINED_ACROSS * across_before:
         return False
-    across, across_before = (_predicted_across(one, link, evidence) for one in (views, views_before))
-    if sum(map(len, across.values())) < _LEAST_ACROSS * sum(map(len, across_before.values())):
+    predicted, predicted_before = (_predicted_across(one, link, evidence) for one in (views, views_before))
+    if _num(predicted) < _LEAST_PREDICTED_ACROSS * _num(predicted_before):
         return False
     # A fold predicts much across, too: it is betrayed by what photos side by side do not share. That pairs
     # across are not verified is no sign of one; what counts is what the joined model finds.
-    return not judge_model(again, {**across, **evidence.verified}).evidence.folded
+    return not judge_model(again, {**predicted, **evidence.verified}).evidence.folded
+
+
+def _num(matches: Mapping[Pair, NDArray[np.int32]]) -> int:
+    return sum(map(len, matches.values()))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Across:
+    """Verified matches between the parts of a link, and those of them that a model explains."""
+
+    num_verified: int
+    num_explained: int
+
+    @property
+    def is_enough(self) -> bool:
+        return 0 < _ENOUGH_ACROSS * self.num_verified <= self.num_explained
+
+
+def _across(explained: Explained, link: WeakLink) -> _Across:
+    pairs = [pair for pair in explained.pairs if pair.is_registered and link.connects(pair.name0, pair.name1)]
+    return _Across(
+        num_verified=sum(pair.num_verified for pair in pairs),
+        num_explained=sum(pair.num_explained for pair in pairs),
+    )
 
 
 def _predicted_across(views: Views, link: WeakLink, evidence: SceneEvidence) -> dict[Pair, NDArray[np.int32]]:
     predicted = evidence.predicted(views)
-    return {pair: m for pair, m in predicted.items() if (pair[0] in link.part0) != (pair[1] in link.part0)}
+    return {pair: matches for pair, matches in predicted.items() if link.connects(*pair)}

@@ -94,6 +94,19 @@ def test_a_part_in_the_wrong_place_is_put_where_few_matches_of_many_pairs_say(tm
     assert all((views_of(wrong)[name].rotation == view.rotation).all() for name, view in before.items())
 
 
+def test_a_part_where_most_verified_matches_across_say_is_not_moved(tmp_path: Path) -> None:
+    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    model = as_one(*parts.models)
+    found = parts.evidence.explain(views_of(model))
+    held = ExplainedPair(
+        name0="a4.jpg", name1="b0.jpg", num_verified=20, num_explained=12, is_registered=True
+    )
+    holding = Explained(pairs=(*found.pairs, held), registered=found.registered)
+    assert weak_links(holding)
+    assert put_together_again(model, holding, parts.database, parts.evidence) is None
+    assert put_together_again(model, found, parts.database, parts.evidence) is not None
+
+
 def test_parts_in_their_right_places_stay(tmp_path: Path) -> None:
     parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
     (right,), _ = join_models(parts.models, parts.database, parts.evidence)
