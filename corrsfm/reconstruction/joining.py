@@ -29,36 +29,20 @@ from corrsfm.reconstruction.calibration import (
 )
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.resection import Landmarks
-from corrsfm.reconstruction.same_points import Candidates, candidates_of, observed, registered_images
+from corrsfm.reconstruction.same_points import Placement, candidates_of, find_placements, registered_images
 from corrsfm.reconstruction.scene_evidence import SceneEvidence
-from corrsfm.reconstruction.similarity import Similarity, find_similarity
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair
 
-__all__ = ["FEWEST_POINTS", "Joining", "Placement", "find_placements", "join_models", "merge_models"]
+__all__ = ["FEWEST_POINTS", "Joining", "join_models", "merge_models"]
 
 FEWEST_POINTS = 15
 """Points that must agree with one similarity. By chance up to 8 do."""
-_MAX_ERROR_SHARE, _LEAST_ERROR_PX = 0.01, 4.0
+_SEES_PX = 4.0
 _MAX_ATTEMPTS = 12
 # Adjusting the whole moves a few matches over a threshold.
 _LEAST_EXPLAINED, _LEAST_PREDICTED = 0.99, 0.97
 _LEAST_ACROSS = 0.5
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Placement:
-    """How two models may lie to one another.
-
-    Attributes
-    ----------
-    a_from_b : Similarity
-    same_points : list of (int, int)
-        Distinct points of a and of b that agree with it and so would be the same.
-    """
-
-    a_from_b: Similarity
-    same_points: list[tuple[int, int]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,39 +150,6 @@ def join_models(
             smaller = (k for k in range(i) if left[k].num_reg_images() < joined.num_reg_images())
             left.insert(next(smaller, i), joined)
     return left, attempts
-
-
-def find_placements(
-    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, candidates: Candidates, *, num: int, seed: int = 0
-) -> list[Placement]:
-    """Similarities between two models that most of what may be the same point agrees with.
-
-    Parameters
-    ----------
-    a, b : pycolmap.Reconstruction
-    candidates : Candidates
-        Of the two.
-    num : int
-        Placements at most. The second is what most of those say that disagree with the first, and so on.
-    seed : int
-
-    Returns
-    -------
-    list of Placement
-        Not necessarily with many points.
-    """
-    longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
-    max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
-    placements: list[Placement] = []
-    while len(placements) < num:
-        side_a, side_b = (observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
-        found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
-        if found is None:
-            break
-        a_from_b, agreeing = found
-        placements.append(Placement(a_from_b=a_from_b, same_points=candidates.same_points(agreeing)))
-        candidates = Candidates(a=candidates.a[~agreeing], b=candidates.b[~agreeing])
-    return placements
 
 
 def _join(
@@ -367,7 +318,7 @@ def _merge_predicted(joined: pycolmap.Reconstruction, across: Mapping[Pair, NDAr
 def _sees(image: pycolmap.Image, point: pycolmap.Point3D, pixel: NDArray[np.float64]) -> bool:
     """Whether a photo would see a point near a pixel."""
     projected = image.project_point(point.xyz)
-    return projected is not None and bool(np.linalg.norm(projected - pixel) <= _LEAST_ERROR_PX)
+    return projected is not None and bool(np.linalg.norm(projected - pixel) <= _SEES_PX)
 
 
 def _objection(

@@ -26,8 +26,8 @@ from corrsfm.reconstruction.calibration import (
 )
 from corrsfm.reconstruction.explained import Explained
 from corrsfm.reconstruction.folds.unfold import judge_model
-from corrsfm.reconstruction.joining import Placement, find_placements, merge_models
-from corrsfm.reconstruction.same_points import candidates_of
+from corrsfm.reconstruction.joining import merge_models
+from corrsfm.reconstruction.same_points import Placement, candidates_of, find_placements
 from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.views import Views, views_of
 from corrsfm.types import Pair

@@ -1,4 +1,4 @@
-"""Which points of two models may be the same, and how photos see them."""
+"""Which points of two models may be the same, and how the models then lie to one another."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from corrsfm.colmap.log import colmap_log
 from corrsfm.colmap.sqlite import database_errors
 from corrsfm.reconstruction.predicted import nearest_descriptors
 from corrsfm.reconstruction.resection import Landmarks
-from corrsfm.reconstruction.similarity import Observed
+from corrsfm.reconstruction.similarity import Observed, Similarity, find_similarity
 from corrsfm.types import Features
 
-__all__ = ["Candidates", "candidates_of", "observed", "registered_images"]
+__all__ = ["Candidates", "Placement", "candidates_of", "find_placements", "registered_images"]
 
 # Comparing descriptors takes time by the square.
 _MAX_POINTS = 20_000
+_MAX_ERROR_SHARE, _LEAST_ERROR_PX = 0.01, 4.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,6 +56,21 @@ class Candidates:
         return same
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Placement:
+    """How two models may lie to one another.
+
+    Attributes
+    ----------
+    a_from_b : Similarity
+    same_points : list of (int, int)
+        Distinct points of a and of b that agree with it and so would be the same.
+    """
+
+    a_from_b: Similarity
+    same_points: list[tuple[int, int]]
+
+
 def candidates_of(
     a: pycolmap.Reconstruction,
     b: pycolmap.Reconstruction,
@@ -83,6 +99,39 @@ def candidates_of(
     ]
     unique = np.unique(np.array(rows, np.int64).reshape(-1, 6), axis=0)
     return Candidates(a=unique[:, :3], b=unique[:, 3:])
+
+
+def find_placements(
+    a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, candidates: Candidates, *, num: int, seed: int = 0
+) -> list[Placement]:
+    """Similarities between two models that most of what may be the same point agrees with.
+
+    Parameters
+    ----------
+    a, b : pycolmap.Reconstruction
+    candidates : Candidates
+        Of the two.
+    num : int
+        Placements at most. The second is what most of those say that disagree with the first, and so on.
+    seed : int
+
+    Returns
+    -------
+    list of Placement
+        Not necessarily with many points.
+    """
+    longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
+    max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
+    placements: list[Placement] = []
+    while len(placements) < num:
+        side_a, side_b = (_observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
+        found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
+        if found is None:
+            break
+        a_from_b, agreeing = found
+        placements.append(Placement(a_from_b=a_from_b, same_points=candidates.same_points(agreeing)))
+        candidates = Candidates(a=candidates.a[~agreeing], b=candidates.b[~agreeing])
+    return placements
 
 
 def registered_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:
@@ -174,7 +223,7 @@ def _described(
     return rows, descriptors
 
 
-def observed(model: pycolmap.Reconstruction, rows: NDArray[np.int64]) -> Observed:
+def _observed(model: pycolmap.Reconstruction, rows: NDArray[np.int64]) -> Observed:
     """The points of observations (M, 3) as in `Candidates`, each with the photo that sees it."""
     num = len(rows)
     rotations, translations = np.zeros((num, 3, 3)), np.zeros((num, 3))
