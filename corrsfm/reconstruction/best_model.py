@@ -194,7 +194,8 @@ def select_model(
             name = model.name + _MENDED
             # It may have more to mend.
             cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
-            return tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
+            mended = tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
+            return dataclasses.replace(mended, is_open=model.is_open)
 
         start, others = None, []
         if first is not None:

@@ -65,7 +65,7 @@ class Mender:
         cameras : StartingCameras
             What it was mapped with in place of the cameras of the database.
         max_runtime_seconds : int
-            For registration, see `corrsfm.reconstruction.registration.register_again`; 0 for no limit.
+            Of either way of mending; 0 for no limit.
 
         Returns
         -------
@@ -92,7 +92,13 @@ class Mender:
     ) -> pycolmap.Reconstruction | None:
         """As `mend`, but only put parts, and register what hung by even less than they."""
         again = put_together_again(
-            model, explained, self._database, self._evidence, seed=self._seed, refinement=self._refinement
+            model,
+            explained,
+            self._database,
+            self._evidence,
+            seed=self._seed,
+            refinement=self._refinement,
+            max_runtime_seconds=max_runtime_seconds,
         )
         if again is None or again.num_reg_images() >= model.num_reg_images():
             return again

@@ -9,6 +9,8 @@ the look of the points, decides together how they lie to one another.
 
 from __future__ import annotations
 
+import math
+import time
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -134,6 +136,7 @@ def put_together_again(
     *,
     seed: int = 0,
     refinement: Refinement = DEFAULT_REFINEMENT,
+    max_runtime_seconds: int = 0,
 ) -> pycolmap.Reconstruction | None:
     """Take a model apart where it hangs by little, and put the parts where most points say.
 
@@ -149,6 +152,8 @@ def put_together_again(
     seed : int
     refinement : Refinement
         What may change of the cameras when the new model is adjusted.
+    max_runtime_seconds : int
+        No other place is tried after so long; 0 for no limit.
 
     Returns
     -------
@@ -163,6 +168,7 @@ def put_together_again(
         If the database cannot be read.
     """
     options = adjustment_options(refinement, num_threads=1)
+    end = time.monotonic() + (max_runtime_seconds or math.inf)
     moved: list[pycolmap.Reconstruction] = []
     # Parts of parts first.
     for link in weak_links(explained)[:_MAX_LINKS][::-1]:
@@ -174,6 +180,8 @@ def put_together_again(
         for placement in find_placements(a, b, candidates, num=_MAX_PLACEMENTS, seed=seed):
             if len(placement.same_points) < _FEWEST_POINTS or (stayed and _is_as_before(placement, a, b)):
                 continue
+            if time.monotonic() > end:
+                break
             again = merge_models(a, b, placement, database, evidence, options=options, seed=seed)
             if _is_better(again, model, link, evidence):
                 moved = [one for one in moved if one is not a and one is not b] + [again]

@@ -1,13 +1,15 @@
 """A part that stands in the wrong place is put where most points say; one that stands right stays."""
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
 
 import pycolmap
 import pytest
 from two_parts import make_two_parts
 
-from corrsfm.reconstruction import mending
+from corrsfm.reconstruction import mending, parts
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
 from corrsfm.reconstruction.explained import Explained, ExplainedPair
 from corrsfm.reconstruction.joining import join_models
@@ -82,58 +84,71 @@ def as_one(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> pycolmap.R
 
 
 def test_a_part_in_the_wrong_place_is_put_where_few_matches_of_many_pairs_say(tmp_path: Path) -> None:
-    parts = make_two_parts(
+    made = make_two_parts(
         tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=40, num_cross_matches=4, num_false_matches=8
     )
-    wrong = as_one(*parts.models)
+    wrong = as_one(*made.models)
     before = views_of(wrong)
-    again = put_together_again(wrong, parts.evidence.explain(before), parts.database, parts.evidence)
+    again = put_together_again(wrong, made.evidence.explain(before), made.database, made.evidence)
     assert again is not None
-    assert relative_pose_differences_deg(views_of(again), views_of(parts.truth)).max() < 0.6
+    assert relative_pose_differences_deg(views_of(again), views_of(made.truth)).max() < 0.6
     assert views_of(wrong).keys() == before.keys()
     assert all((views_of(wrong)[name].rotation == view.rotation).all() for name, view in before.items())
 
 
 def test_a_part_where_most_verified_matches_across_say_is_not_moved(tmp_path: Path) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
-    model = as_one(*parts.models)
-    found = parts.evidence.explain(views_of(model))
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    model = as_one(*made.models)
+    found = made.evidence.explain(views_of(model))
     held = ExplainedPair(
         name0="a4.jpg", name1="b0.jpg", num_verified=20, num_explained=12, is_registered=True
     )
     holding = Explained(pairs=(*found.pairs, held), registered=found.registered)
     assert weak_links(holding)
-    assert put_together_again(model, holding, parts.database, parts.evidence) is None
-    assert put_together_again(model, found, parts.database, parts.evidence) is not None
+    assert put_together_again(model, holding, made.database, made.evidence) is None
+    assert put_together_again(model, found, made.database, made.evidence) is not None
+
+
+def test_no_other_place_is_tried_once_the_time_is_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    model = as_one(*made.models)
+    clock = itertools.count(step=10)
+    monkeypatch.setattr(parts, "time", SimpleNamespace(monotonic=lambda: next(clock)))
+    found = made.evidence.explain(views_of(model))
+    given = model, found, made.database, made.evidence
+    assert put_together_again(*given, max_runtime_seconds=5) is None
+    assert put_together_again(*given) is not None
 
 
 def test_parts_in_their_right_places_stay(tmp_path: Path) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
-    (right,), _ = join_models(parts.models, parts.database, parts.evidence)
-    found = parts.evidence.explain(views_of(right))
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    (right,), _ = join_models(made.models, made.database, made.evidence)
+    found = made.evidence.explain(views_of(right))
     assert weak_links(found)
-    assert put_together_again(right, found, parts.database, parts.evidence) is None
+    assert put_together_again(right, found, made.database, made.evidence) is None
 
 
 @pytest.mark.parametrize(("angles_deg", "num_common"), [(NEXT_TO, 6), (SIDE_BY_SIDE, 100)])
 def test_parts_stay_where_too_little_speaks_or_a_fold_would_come(
     angles_deg: tuple[range, range], num_common: int, tmp_path: Path
 ) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=angles_deg, num_common_points=num_common)
-    model = as_one(*parts.models)
-    found = parts.evidence.explain(views_of(model))
+    made = make_two_parts(tmp_path / "d.db", angles_deg=angles_deg, num_common_points=num_common)
+    model = as_one(*made.models)
+    found = made.evidence.explain(views_of(model))
     assert weak_links(found)
-    assert put_together_again(model, found, parts.database, parts.evidence) is None
+    assert put_together_again(model, found, made.database, made.evidence) is None
 
 
 def test_photos_that_fell_out_are_registered_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    parts = make_two_parts(tmp_path / "d.db", angles_deg=(range(0, 60, 10), ()), num_common_points=80)
-    (whole, _) = parts.models
+    made = make_two_parts(tmp_path / "d.db", angles_deg=(range(0, 60, 10), ()), num_common_points=80)
+    (whole, _) = made.models
     without = pycolmap.Reconstruction(whole)
     without.deregister_frame(without.find_image_with_name("a5.jpg").frame_id)
     monkeypatch.setattr(mending, "put_together_again", lambda *_, **__: without)
-    mender = Mender(parts.evidence, parts.database, tmp_path / "work")
-    mended = mender.mend(whole, parts.evidence.explain(views_of(whole)))
+    mender = Mender(made.evidence, made.database, tmp_path / "work")
+    mended = mender.mend(whole, made.evidence.explain(views_of(whole)))
     assert mended is not None
-    assert relative_pose_differences_deg(views_of(mended), views_of(parts.truth)).max() < 0.6
+    assert relative_pose_differences_deg(views_of(mended), views_of(made.truth)).max() < 0.6
     assert len(views_of(mended)) == 6
