@@ -13,20 +13,29 @@ import json
 import shlex
 import shutil
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from corrsfm.evaluation.metrics import extent_of
 from corrsfm.evaluation.records import provenance, save_results
+from corrsfm.evaluation.scenes.score import read_poses
+from corrsfm.geometry import Pose, camera_centre
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tools.whole_scenes import call, measure  # noqa: E402
+
+_NEAR_SHARE, _NEAR_DEG = 0.05, 10.0
 
 
 def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
     """One seed of a scene: what was noticed and done, and the score with and without it."""
 
+    workspace = pruned.with_name("workspace")
+
     def reconstruct(*flags: str) -> tuple[dict[str, Any], dict[str, Any]]:
-        workspace = pruned.with_name("workspace")
         shutil.rmtree(workspace, ignore_errors=True)
         shutil.copytree(pruned, workspace)
         for command in (["prune"], ["reconstruct", *flags]):
@@ -36,6 +45,7 @@ def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
         return measure(workspace, scene, seed), found
 
     row, evidence = reconstruct()
+    row["num_in_place"] = count_in_place(read_poses(workspace), read_poses(scene))
     folds = evidence.get("folds", {})
     names = [model["name"] for model in evidence.get("models_tried", []) if model["chosen"]]
     row |= {
@@ -49,6 +59,30 @@ def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
         plain, evidence = reconstruct("--no-unfold")
         row["without"] = plain | {"folded": evidence.get("folds", {}).get("folded")}
     return row
+
+
+def count_in_place(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> int:
+    """Photos in the largest set that one similarity brings near their known cameras.
+
+    Near is within 5 % of the extent of the known centres and 10 degrees. Every two photos suggest one.
+    """
+    names = sorted(poses.keys() & truth.keys())
+    known, found = (
+        np.array([camera_centre(own[name]) for name in names]).reshape(-1, 3) for own in (truth, poses)
+    )
+    extent = extent_of(np.array([camera_centre(pose) for pose in truth.values()]))
+    turns = np.array([truth[name][0].T @ poses[name][0] for name in names])
+    most = 0
+    for i, turn in enumerate(turns):
+        trace = np.einsum("jk,mjk->m", turn, turns)
+        turned = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+        for j in range(len(names)):
+            if np.linalg.norm(found[j] - found[i]) > 0:
+                scale = np.linalg.norm(known[j] - known[i]) / np.linalg.norm(found[j] - found[i])
+                moved = known[i] + scale * (found - found[i]) @ turn.T
+                near = np.linalg.norm(moved - known, axis=1) <= _NEAR_SHARE * extent
+                most = max(most, int((near & (turned <= _NEAR_DEG)).sum()))
+    return most
 
 
 def main() -> None:

@@ -85,20 +85,25 @@ def _costs_table(values: dict[str, Any]) -> Table:
 
 
 def _folds_table(values: dict[str, Any]) -> Table:
-    """Scenes of which a model was unfolded or called folded; the caption counts the others."""
-    header = ["scene", "photos", "unfolded", "called folded", "AUC@5 with --no-unfold", "AUC@5"]
+    """Scenes of which a model was unfolded, mended or called folded; the caption counts the others."""
+    header = [
+        *("scene", "photos", "unfolded", "mended", "called folded"),
+        *("photos in place", "AUC@5 with --no-unfold", "AUC@5"),
+    ]
     rows, quiet = [], []
     for scene, runs in values["rows"].items():
         unfolded = sum(run["unfolded_by"] is not None for run in runs)
+        mended = sum("+mended" in (run.get("chosen") or "") for run in runs)
         folded = sum(bool(run["still_folded"]) for run in runs)
-        if not unfolded and not folded:
+        if not unfolded and not mended and not folded:
             quiet.append(runs)
             continue
         rows.append(
             [
                 scene,
                 str(runs[0]["num_photos"]),
-                *(f"{number} of {len(runs)}" for number in (unfolded, folded)),
+                *(f"{number} of {len(runs)}" for number in (unfolded, mended, folded)),
+                str(min(run["num_in_place"] for run in runs)) if "num_in_place" in runs[0] else "–",
                 *(
                     median_and_worst_of(auc)
                     for auc in (map(_auc_without, runs), (run["auc5"] for run in runs))
@@ -106,8 +111,9 @@ def _folds_table(values: dict[str, Any]) -> Table:
             ]
         )
     caption = (
-        f"AUC@5: median (worst). On {len(quiet)} other scenes, in {sum(map(len, quiet))} runs, nothing was "
-        "unfolded or called folded."
+        "AUC@5: median (worst); photos in place: the fewest of the runs. "
+        f"On {len(quiet)} other scenes, in {sum(map(len, quiet))} runs, nothing was unfolded, mended or "
+        "called folded."
     )
     return Table(header=header, rows=rows, caption=caption)
 

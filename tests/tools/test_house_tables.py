@@ -55,7 +55,13 @@ def test_reliability_is_a_table(tmp_path: Path) -> None:
 
 
 def fold_run(auc5: float, *, unfolded_from: float | None = None, still_folded: bool = False) -> dict:
-    run = {"auc5": auc5, "num_photos": 14, "unfolded_by": None, "still_folded": still_folded}
+    run = {
+        "auc5": auc5,
+        "num_photos": 14,
+        "unfolded_by": None,
+        "still_folded": still_folded,
+        "num_in_place": 13,
+    }
     if unfolded_from is not None:
         run |= {"unfolded_by": "unfolded-votes", "without": {"auc5": unfolded_from, "folded": True}}
     return run
@@ -64,5 +70,5 @@ def fold_run(auc5: float, *, unfolded_from: float | None = None, still_folded: b
 def test_folds_are_a_table_of_the_scenes_that_have_some() -> None:
     mug = [fold_run(90, unfolded_from=30), fold_run(40, still_folded=True), fold_run(80, unfolded_from=20)]
     table = HOUSE_TABLES["folds"]({"rows": {"mug": mug, "relief": [fold_run(99), fold_run(98)]}})
-    assert table.rows == [["mug", "14", "2 of 3", "1 of 3", "30.0 (20.0)", "80.0 (40.0)"]]
+    assert table.rows == [["mug", "14", "2 of 3", "0 of 3", "1 of 3", "13", "30.0 (20.0)", "80.0 (40.0)"]]
     assert "On 1 other scenes, in 2 runs" in table.caption
