@@ -291,10 +291,9 @@ class PruneConfig:
     max_error_px: float = option(
         4.0, "Inlier threshold of the robust estimators", unit="px", above=0, used_with=_ESTIMATOR
     )
-    max_candidates: int | None = option(
-        None,
-        "Matches per pair that the network sees, of the kind that it reads, best ratio first; if not given "
-        "1,024 for one that reads mutual matches, 2,000 for one that reads all",
+    max_candidates: int = option(
+        2000,
+        "Matches per pair that the network sees, of the kind that it reads, best ratio first",
         minimum=16,
         used_with=_NETWORK,
     )

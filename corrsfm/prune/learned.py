@@ -33,9 +33,6 @@ _MIN_NUM_FOR_MATRIX = 8
 MIN_BFLOAT16_CHANNELS = 64
 
 # Below these counts a pair says too little for the guard to judge it.
-# Of 240 validation pairs of 4,096 keypoints, the half of mutual matches with the best ratios gives the poses
-# of all, in seven tenths of the time. Published networks learned from 2,000 matches.
-_MAX_CANDIDATES = {MatchInput.MUTUAL: 1024, MatchInput.ALL: 2000}
 _GUARD_MIN_MATCHES = 50
 _GUARD_RATIO = 0.8
 _GUARD_MIN_SHARE = 0.1
@@ -110,9 +107,9 @@ class Pruner:
         auto, cpu, cuda or cuda:N.
     operating_point : OperatingPoint
         See `corrsfm.prune.selection.select_kept`.
-    max_candidates : int, optional
-        Matches of a pair that the network sees, of those it reads, smallest ratio first; by default 1,024 of
-        the mutual ones or 2,000 of all. Its essential matrix is verified on all putative matches.
+    max_candidates : int
+        Matches of a pair that the network sees, of those it reads, smallest ratio first. Its essential matrix
+        is verified on all putative matches.
     max_batch_matches : int
         Bound of the matches in a batch, padding included; bounds memory.
     precision : Precision
@@ -144,7 +141,7 @@ class Pruner:
         checkpoint_sha256: str = "in memory",
         device: str = "auto",
         operating_point: OperatingPoint = PruneConfig.operating_point,
-        max_candidates: int | None = PruneConfig.max_candidates,
+        max_candidates: int = PruneConfig.max_candidates,
         max_batch_matches: int = PruneConfig.max_batch_matches,
         precision: Precision = PruneConfig.precision,
         threads: int = 0,
@@ -170,13 +167,13 @@ class Pruner:
         if compile:
             self._network = torch.compile(network, dynamic=True)
         self._operating_point = operating_point
-        self._max_candidates = max_candidates or _MAX_CANDIDATES[network.usage.input]
+        self._max_candidates = max_candidates
         self._max_batch_matches = max_batch_matches
         self._warned = False
         usage = " ".join(f"{name}={value}" for name, value in to_dict(self._usage, only_result=True).items())
         self.fingerprint = (
-            f"{self.name}-4 sha256={checkpoint_sha256} operating_point={operating_point} "
-            f"max_candidates={self._max_candidates} dtype={self.dtype} {usage}"
+            f"{self.name}-3 sha256={checkpoint_sha256} operating_point={operating_point} "
+            f"max_candidates={max_candidates} dtype={self.dtype} {usage}"
         )
 
     @classmethod
@@ -239,20 +236,21 @@ class Pruner:
         candidates = [select_candidates(pair, self._max_candidates, self._usage.input) for pair in pairs]
         self._guard(pairs)
         estimates = self._estimate(pairs, candidates)
-        return [self._result(pair, estimate) for pair, estimate in zip(pairs, estimates, strict=True)]
+        return [
+            self._result(pair, len(rows), estimate)
+            for pair, rows, estimate in zip(pairs, candidates, estimates, strict=True)
+        ]
 
-    def _result(self, pair: Correspondences, estimate: NetworkEstimate) -> PruneResult:
+    def _result(self, pair: Correspondences, num_candidates: int, estimate: NetworkEstimate) -> PruneResult:
         model, residuals = None, np.full(len(pair), np.inf, np.float32)
         if estimate.essential is not None:
             model = TwoViewModel(kind="essential", matrix=estimate.essential)
             residuals = normalised_residuals(model, pair)
         scores = score_matches(estimate.logits, residuals)
-        readable = readable_matches(pair, self._usage.input)
-        scores[~readable] = 0
-        num_readable = int(np.count_nonzero(readable))
+        scores[~readable_matches(pair, self._usage.input)] = 0
         return PruneResult(
             scores=scores,
-            inlier_mask=select_kept(pair, scores, self._operating_point, self._usage, num_readable),
+            inlier_mask=select_kept(pair, scores, self._operating_point, self._usage, num_candidates),
             model=model,
             residuals=residuals if model is not None else np.full(len(pair), np.nan, np.float32),
             decided_by=self.name,

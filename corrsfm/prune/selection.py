@@ -99,7 +99,7 @@ def select_kept(
     scores: NDArray[np.float32],
     operating_point: OperatingPoint,
     usage: NetworkUsage,
-    num_readable: int,
+    num_candidates: int,
 ) -> NDArray[np.bool_]:
     """The matches to keep at an operating point.
 
@@ -119,8 +119,8 @@ def select_kept(
         from overlapping photos and find structure everywhere: of 114 pairs of a validation scene that share
         nothing, 110 passed COLMAP's verification without this.)
     usage : NetworkUsage
-    num_readable : int
-        Matches of the kind that the network reads, whether it saw them or not.
+    num_candidates : int
+        Matches that the network saw.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def select_kept(
     if operating_point is OperatingPoint.POSE:
         return scores > usage.pose_min_score
     confident = pair.mutual & (scores > usage.confident_score)
-    needed = max(usage.min_num_confident, usage.min_confident_share * num_readable)
+    needed = max(usage.min_num_confident, usage.min_confident_share * num_candidates)
     if np.count_nonzero(confident) < needed:
         return confident
     return pair.mutual & (scores > usage.sfm_min_score)

@@ -12,9 +12,9 @@ from corrsfm.config import MatchInput, NetworkUsage, OperatingPoint, Precision, 
 from corrsfm.errors import CheckpointError, CorrsfmError, InputError
 from corrsfm.model import CorrAdaptor, NetworkConfig, save_network
 from corrsfm.model.rivals import RivalConfig, build_rival
-from corrsfm.prune import Pruner, build_pruner, learned
+from corrsfm.prune import Pruner, build_pruner
 from corrsfm.prune.learned import choose_precision, pack_batches
-from corrsfm.prune.selection import select_candidates, select_kept
+from corrsfm.prune.selection import select_candidates
 
 SMALL = NetworkConfig(
     channels=16, clusters=12, neighbors=(6, 3), fusion_rounds=1, motion_stacking=1, heads=2, side_channels=2
@@ -178,31 +178,6 @@ def test_a_network_of_mutual_matches_is_fed_nothing_else(network, mutual_network
     # Candidates are counted among the mutual ones; those left over are judged by the matrix.
     (bounded,) = pruner_of(mutual_network, max_candidates=len(mutual) - 1)([pair])
     assert not bounded.scores[~pair.mutual].any()
-
-
-def test_how_many_matches_a_network_sees_goes_by_the_kind_it_reads(network, mutual_network):
-    pair = make(num=2100)
-    pair = dataclasses.replace(pair, mutual=np.ones(2100, bool))
-    for reader, expected in ((network, 2000), (mutual_network, 1024)):
-        seen = []
-        pruner = pruner_of(reader)
-        run = pruner._network
-
-        def counting(matches, side, mask, run=run, seen=seen):
-            seen.append(matches.shape[1] if mask is None else int(mask.sum()))
-            return run(matches, side, mask)
-
-        pruner._network = counting
-        pruner([pair])
-        assert seen == [expected] and f"max_candidates={expected} " in pruner.fingerprint
-
-
-def test_confident_matches_are_counted_against_all_that_could_be_read(mutual_network, monkeypatch):
-    pair = make(num=300)
-    asked = []
-    monkeypatch.setattr(learned, "select_kept", lambda *given: asked.append(given[-1]) or select_kept(*given))
-    pruner_of(mutual_network, max_candidates=64)([pair])
-    assert asked == [np.count_nonzero(pair.mutual)] and asked[0] > 64
 
 
 def test_a_pair_without_mutual_matches_keeps_nothing(mutual_network):
