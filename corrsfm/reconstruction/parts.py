@@ -36,7 +36,7 @@ from corrsfm.types import Pair
 
 __all__ = ["WeakLink", "put_together_again", "weak_links"]
 
-# No right model of 38 training and validation scenes has parts of three photos that hang by so little.
+# The false links of kitchen_lego, the scene that they were found on, have 0.05 to 0.12.
 _WEAK_STRENGTH = 0.3
 _FEWEST_PHOTOS = 3
 # By chance up to 8 points agree; what is made of them is looked at again.
