@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from corrsfm.errors import CorrsfmError
 from corrsfm.evaluation.metrics import extent_of
 from corrsfm.evaluation.records import provenance, save_results
 from corrsfm.evaluation.scenes.score import read_poses
@@ -45,7 +46,10 @@ def run_seed(scene: Path, pruned: Path, seed: int) -> dict[str, Any]:
         return measure(workspace, scene, seed), found
 
     row, evidence = reconstruct()
-    row["num_in_place"] = count_in_place(read_poses(workspace), read_poses(scene))
+    try:
+        row["num_in_place"] = count_in_place(read_poses(workspace), read_poses(scene))
+    except CorrsfmError:
+        row["num_in_place"] = 0
     folds = evidence.get("folds", {})
     names = [model["name"] for model in evidence.get("models_tried", []) if model["chosen"]]
     row |= {
@@ -77,8 +81,10 @@ def count_in_place(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> int:
         trace = np.einsum("jk,mjk->m", turn, turns)
         turned = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
         for j in range(len(names)):
-            if np.linalg.norm(found[j] - found[i]) > 0:
-                scale = np.linalg.norm(known[j] - known[i]) / np.linalg.norm(found[j] - found[i])
+            baseline, found_baseline = (np.linalg.norm(own[j] - own[i]) for own in (known, found))
+            # Two cameras in one place would shrink everything to it.
+            if baseline > _NEAR_SHARE * extent and found_baseline > 0:
+                scale = baseline / found_baseline
                 moved = known[i] + scale * (found - found[i]) @ turn.T
                 near = np.linalg.norm(moved - known, axis=1) <= _NEAR_SHARE * extent
                 most = max(most, int((near & (turned <= _NEAR_DEG)).sum()))

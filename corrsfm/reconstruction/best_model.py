@@ -88,8 +88,8 @@ def select_model(
 ) -> Selection | None:
     """Keep the first model if it convinces, else try candidates and take the one that predicts most matches.
 
-    A first model that is folded by repeated structure is unfolded instead: a fold predicts and
-    explains as much as a right model.
+    A first model that is folded by repeated structure is unfolded instead, if that explains enough: a fold
+    predicts and explains as much as a right model.
 
     Parameters
     ----------
@@ -127,6 +127,7 @@ def select_model(
     """
     models: dict[str, pycolmap.Reconstruction] = {}
     left_out: dict[str, tuple[Pair, ...]] = {}
+    taken_apart: set[str] = set()
 
     def tried(
         name: str,
@@ -180,22 +181,28 @@ def select_model(
         mender = Mender(evidence, database, workdir / "again", seed=seed, refinement=refinement)
 
         def mend(model: Tried, *, parts_only: bool = False) -> Tried | None:
-            if not budget.seconds_left:
-                return None
-            with budget.spent() as spent:
-                again = (mender.put_parts if parts_only else mender.mend)(
-                    models[model.name],
-                    model.explained,
-                    cameras=cameras_of.get(model.name, StartingCameras.AS_IS),
-                    max_runtime_seconds=budget.seconds_left,
-                )
-            if again is None:
+            cameras = cameras_of.get(model.name, StartingCameras.AS_IS)
+            ways = [] if model.name in taken_apart else [mender.put_parts]
+            taken_apart.add(model.name)
+            for way in ways if parts_only else [*ways, mender.register_misplaced]:
+                left = budget.seconds_left
+                if not left:
+                    return None
+                with budget.spent() as spent:
+                    again = way(
+                        models[model.name], model.explained, cameras=cameras, max_runtime_seconds=left
+                    )
+                if again is not None:
+                    break
+            else:
                 return None
             name = model.name + _MENDED
+            while name in models:
+                name += _MENDED
             # It may have more to mend.
-            cameras_of[name] = cameras_of.get(model.name, StartingCameras.AS_IS)
-            mended = tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
-            return dataclasses.replace(mended, is_open=model.is_open)
+            cameras_of[name], left_out[name] = cameras, left_out.get(model.name, ())
+            outcome = tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
+            return dataclasses.replace(outcome, is_open=model.is_open)
 
         start, others = None, []
         if first is not None:
@@ -212,24 +219,31 @@ def select_model(
             others = [outcome for outcome in others if outcome is not start]
         if start is None:
             return None
-        if policy.max_models > 1 and (again := mend(start, parts_only=True)) is not None:
-            start, others = again, [start, *others]
-        attempt = judge_model(models[start.name], evidence.verified)
+        mended = mend(start, parts_only=True) if policy.max_models > 1 else None
+        whole = mended is not None and mended.num_registered >= start.num_registered
+        judged = mended if mended is not None and whole else start
+        attempt = judge_model(models[judged.name], evidence.verified)
         if unfold:
-            with budget.spent():
+            with budget.spent() as spent:
                 part = TimeBudget(_SHARE_TO_UNFOLD * budget.seconds_left)
                 best = unfold_model(attempt, evidence, database, workdir, seed, refinement, part)
             if best is not attempt:
-                selection = _selection_of(best, start, evidence, first_seconds)
-                explained = selection.choice.chosen.explained
-                if explained.is_enough(explained.share) or explained.is_enough_of_supported:
-                    return selection
-                # Whatever it was, it was more than a fold.
-                others = [*others, tried(selection.choice.chosen.name, best.model, first_seconds)]
-                left_out[selection.choice.chosen.name] = best.removed
+                unfolded = _tried_unfolded(best, evidence, spent())
+                if unfolded.explained.is_enough(unfolded.explained.share) or (
+                    unfolded.explained.is_enough_of_supported
+                ):
+                    known = (one for one in (start, mended, *others) if one is not None)
+                    return _selection_of(best, unfolded, tuple(known), len(evidence.names))
+                # Whatever the first model was, it was more than a fold.
+                unfolded = dataclasses.replace(
+                    unfolded, has_more_cameras=has_more_cameras(StartingCameras.AS_IS)
+                )
+                others = [*others, unfolded]
+                models[unfolded.name], left_out[unfolded.name] = best.model, best.removed
         choice = choose_model(
             start,
             bank,
+            mended=mended,
             others=others,
             num_photos=len(evidence.names),
             map_round=map_round,
@@ -238,7 +252,7 @@ def select_model(
             mend=mend,
         )
     model = models[choice.chosen.name]
-    if choice.chosen is not start:
+    if choice.chosen.name != judged.name:
         attempt = judge_model(model, evidence.verified)
     return Selection(
         model=model,
@@ -262,25 +276,31 @@ def _are_mostly_of_one_size(model: pycolmap.Reconstruction) -> bool:
     return 2 * max(sizes.values(), default=0) >= len(cameras)
 
 
-def _selection_of(attempt: Attempt, first: Tried, evidence: SceneEvidence, first_seconds: float) -> Selection:
-    """An unfolded model as the selection; what it explains is counted without the pairs left out."""
+def _tried_unfolded(attempt: Attempt, evidence: SceneEvidence, seconds: float) -> Tried:
+    """An unfolded model; what it explains is counted without the pairs left out."""
     views = views_of(attempt.model)
     left_out = set(attempt.removed)
     verified = {pair: matches for pair, matches in evidence.verified.items() if pair not in left_out}
-    chosen = Tried(
+    return Tried(
         name="-".join(["unfolded", *attempt.rules]),
         way=MapperKind.INCREMENTAL,
         views=views,
         explained=explain(views, evidence.keypoints, verified),
-        seconds=first_seconds,
+        seconds=seconds,
     )
+
+
+def _selection_of(attempt: Attempt, unfolded: Tried, known: tuple[Tried, ...], num_photos: int) -> Selection:
+    """An unfolded model as the selection."""
     choice = Choice(
-        chosen=chosen, tried=(first, chosen), reason="the first model was folded by repeated structure"
+        chosen=unfolded,
+        tried=(*known, unfolded),
+        reason="the first model was folded by repeated structure",
     )
     return Selection(
         model=attempt.model,
         choice=choice,
-        verdict=_verdict(attempt.model, choice, len(evidence.names), attempt.evidence),
+        verdict=_verdict(attempt.model, choice, num_photos, attempt.evidence),
         folds=attempt.evidence,
         left_out=attempt.removed,
     )

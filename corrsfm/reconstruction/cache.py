@@ -45,7 +45,8 @@ def load_cache(database: Path, *models: pycolmap.Reconstruction) -> pycolmap.Dat
 def _take_over_cameras(tables: pycolmap.Database, model: pycolmap.Reconstruction, done: set[str]) -> set[str]:
     """Give photos of a database the cameras that they have in a model; the names of all its photos."""
     frame_of = {data.id: frame for frame in tables.read_all_frames() for data in frame.image_ids}
-    of_model = {image.name: image for image in model.images.values() if image.has_pose}
+    # Also of photos that it could not place: a part of a model may be joined to another by them.
+    of_model = {image.name: image for image in model.images.values() if image.camera_id in model.cameras}
     for image in tables.read_all_images():
         if image.name not in of_model or image.name in done:
             continue

@@ -115,7 +115,8 @@ class Choice:
     ----------
     chosen : Tried
     tried : tuple of Tried
-        In the order of trying, the first model first; candidates that gave no model are missing.
+        The first model, what was made of it, and candidates in the order of trying; without those that gave
+        no model.
     num_failed : int
         Candidates that gave no model.
     reason : str
@@ -155,6 +156,7 @@ def choose_model(
     map_round: Callable[[Sequence[C]], Sequence[Tried | None]],
     count_predicted: Callable[[Views], int],
     policy: ChoicePolicy,
+    mended: Tried | None = None,
     others: Sequence[Tried | None] = (),
     mend: Callable[[Tried], Tried | None] = lambda model: None,
 ) -> Choice:
@@ -172,6 +174,8 @@ def choose_model(
     count_predicted : callable
         Number of predicted matches of a model.
     policy : ChoicePolicy
+    mended : Tried, optional
+        The first model with parts put elsewhere; the better of the two may need no second, either.
     others : sequence of Tried or None
         Candidates that have been mapped already.
     mend : callable, optional
@@ -183,26 +187,32 @@ def choose_model(
     Choice
         Of equal models the earlier is taken, so the first one stays unless another is better.
     """
-    if good_enough(first, num_photos, policy):
-        known = (first, *(model for model in others if model is not None))
-        return Choice(chosen=first, tried=known, reason="the first model is good enough")
-    if not bank or policy.max_models < 2:
+    if mended is None and good_enough(first, num_photos, policy):
+        return Choice(chosen=first, tried=(first,), reason="the first model is good enough")
+    known = [model for model in (first, mended, *others) if model is not None]
+    if len(known) == 1 and (not bank or policy.max_models < 2):
         return Choice(chosen=first, tried=(first,), reason="no other candidate was to be tried")
 
     def counted(model: Tried) -> Tried:
         return dataclasses.replace(model, num_predicted=count_predicted(model.views))
 
-    mended: set[str] = set()
+    asked: set[str] = set()
 
     def mend_best(outcomes: list[Tried | None]) -> None:
         best = _best([model for model in outcomes if model is not None])
-        if best.name not in mended:
-            mended.add(best.name)
+        if best.name not in asked:
+            asked.add(best.name)
             again = mend(best)
             if again is not None:
                 outcomes.append(counted(again))
 
-    outcomes: list[Tried | None] = [None if model is None else counted(model) for model in (first, *others)]
+    outcomes: list[Tried | None] = [*map(counted, known), *([None] * others.count(None))]
+    if mended is not None:
+        counts = [model for model in outcomes if model is not None]
+        best = _best(counts[:2])
+        if good_enough(best, num_photos, policy):
+            reason = "the first model, mended, is good enough"
+            return Choice(chosen=best, tried=tuple(counts), reason=reason)
     mend_best(outcomes)
     affordable = bank[: max(policy.max_models - len(outcomes), 0)]
     reason = "all candidates have been tried"

@@ -43,6 +43,7 @@ _MAX_ATTEMPTS = 12
 # Adjusting the whole moves a few matches over a threshold.
 _LEAST_EXPLAINED, _LEAST_PREDICTED = 0.99, 0.97
 _LEAST_ACROSS = 0.5
+_IMPOSSIBLE = "the joined model has a camera that cannot be"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,8 +162,8 @@ def _join(
     seed: int,
 ) -> tuple[pycolmap.Reconstruction | None, Joining]:
     candidates = candidates_of(a, b, database, evidence.features)
-    placements = find_placements(a, b, candidates, num=1, seed=seed)
-    num_points = max((len(one.same_points) for one in placements), default=0)
+    placement = next(find_placements(a, b, candidates, num=1, seed=seed), None)
+    num_points = 0 if placement is None else len(placement.same_points)
 
     def outcome(reason: str, joined: bool = False) -> Joining:
         return Joining(
@@ -174,13 +175,13 @@ def _join(
             reason=reason,
         )
 
-    if num_points < FEWEST_POINTS:
+    if placement is None or num_points < FEWEST_POINTS:
         return None, outcome(
             f"{num_points} points agree on how they lie to one another, {FEWEST_POINTS} are needed: photos "
             "that show what both show would join them"
         )
-    joined = merge_models(a, b, placements[0], database, evidence, options=options, seed=seed)
-    objection = _objection(a, b, joined, evidence)
+    joined = merge_models(a, b, placement, database, evidence, options=options, seed=seed)
+    objection = _IMPOSSIBLE if joined is None else _objection(a, b, joined, evidence)
     if objection:
         return None, outcome(f"{num_points} points agree on how they lie to one another, but {objection}")
     return joined, outcome(f"{num_points} points agree on how they lie to one another", joined=True)
@@ -195,7 +196,7 @@ def merge_models(
     *,
     options: pycolmap.BundleAdjustmentOptions,
     seed: int = 0,
-) -> pycolmap.Reconstruction:
+) -> pycolmap.Reconstruction | None:
     """One adjusted model of two, held together by the same points and by the matches that it predicts.
 
     Parameters
@@ -211,14 +212,16 @@ def merge_models(
 
     Returns
     -------
-    pycolmap.Reconstruction
-        In the frame of a.
+    pycolmap.Reconstruction or None
+        In the frame of a; None if adjusting gave a camera that cannot be.
     """
     merged = _merged(a, b, placement, database, seed)
     refine(merged, options)
+    if not has_possible_cameras(merged):
+        return None
     if _merge_predicted(merged, _across(a, b, evidence.predicted(views_of(merged)))):
         refine(merged, options)
-    return merged
+    return merged if has_possible_cameras(merged) else None
 
 
 def _merged(
@@ -329,7 +332,7 @@ def _objection(
 ) -> str:
     """What speaks against a joined model, a clause; empty if nothing does."""
     views_a, views_b, views = views_of(a), views_of(b), views_of(joined)
-    if views.keys() < views_a.keys() | views_b.keys() or not has_possible_cameras(joined):
+    if views.keys() < views_a.keys() | views_b.keys():
         return "the joined model lost photos"
     explained = {(p.name0, p.name1): p for p in evidence.explain(views).pairs}
     parts: dict[Pair, int] = defaultdict(int)

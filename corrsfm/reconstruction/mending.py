@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pycolmap
 
+from corrsfm.reconstruction.budget import TimeBudget
 from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement
 from corrsfm.reconstruction.candidates import StartingCameras
 from corrsfm.reconstruction.explained import Explained
@@ -46,7 +47,7 @@ class Mender:
         self._seed = seed
         self._refinement = refinement
 
-    def mend(
+    def put_parts(
         self,
         model: pycolmap.Reconstruction,
         explained: Explained,
@@ -54,7 +55,7 @@ class Mender:
         cameras: StartingCameras = StartingCameras.AS_IS,
         max_runtime_seconds: int = 0,
     ) -> pycolmap.Reconstruction | None:
-        """Put parts where most points say; if there are none to put, register misplaced photos again.
+        """Put parts where most points say, and register what hung by even less than they.
 
         Parameters
         ----------
@@ -65,24 +66,36 @@ class Mender:
         cameras : StartingCameras
             What it was mapped with in place of the cameras of the database.
         max_runtime_seconds : int
-            Of either way of mending; 0 for no limit.
+            0 for no limit.
 
         Returns
         -------
         pycolmap.Reconstruction or None
-            None if there is nothing to mend, or nothing better was found.
+            None if there is no part to put, or no better place.
 
         Raises
         ------
         DatabaseError
             If the database cannot be read.
         """
-        again = self.put_parts(model, explained, cameras=cameras, max_runtime_seconds=max_runtime_seconds)
-        if again is not None or not explained.misplaced:
+        budget = TimeBudget(max_runtime_seconds)
+        with budget.spent():
+            again = put_together_again(
+                model,
+                explained,
+                self._database,
+                self._evidence,
+                seed=self._seed,
+                refinement=self._refinement,
+                max_runtime_seconds=max_runtime_seconds,
+            )
+        if again is None or again.num_reg_images() >= model.num_reg_images():
             return again
-        return self._register(model, explained.misplaced, cameras, max_runtime_seconds)
+        if max_runtime_seconds and not budget.seconds_left:
+            return again
+        return self._register(again, (), cameras, budget.seconds_left) or again
 
-    def put_parts(
+    def register_misplaced(
         self,
         model: pycolmap.Reconstruction,
         explained: Explained,
@@ -90,19 +103,10 @@ class Mender:
         cameras: StartingCameras = StartingCameras.AS_IS,
         max_runtime_seconds: int = 0,
     ) -> pycolmap.Reconstruction | None:
-        """As `mend`, but only put parts, and register what hung by even less than they."""
-        again = put_together_again(
-            model,
-            explained,
-            self._database,
-            self._evidence,
-            seed=self._seed,
-            refinement=self._refinement,
-            max_runtime_seconds=max_runtime_seconds,
-        )
-        if again is None or again.num_reg_images() >= model.num_reg_images():
-            return again
-        return self._register(again, (), cameras, max_runtime_seconds) or again
+        """Register misplaced photos again, see `put_parts`; None if there are none, or that gave nothing."""
+        if not explained.misplaced:
+            return None
+        return self._register(model, explained.misplaced, cameras, max_runtime_seconds)
 
     def _register(
         self,

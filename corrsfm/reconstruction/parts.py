@@ -9,7 +9,9 @@ the look of the points, decides together how they lie to one another.
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
 import time
 from collections import defaultdict
 from collections.abc import Mapping
@@ -20,12 +22,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from corrsfm.reconstruction.calibration import (
-    DEFAULT_REFINEMENT,
-    Refinement,
-    adjustment_options,
-    has_possible_cameras,
-)
+from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement, adjustment_options
 from corrsfm.reconstruction.explained import Explained
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.joining import merge_models
@@ -48,6 +45,7 @@ _SAME_TURN_DEG, _SAME_PLACE = 10.0, 0.1
 # which some are false, so the right place may explain fewer than a wrong one; but it predicts far more.
 _ENOUGH_ACROSS = 0.5
 _LEAST_EXPLAINED_WITHIN, _LEAST_EXPLAINED_ACROSS, _LEAST_PREDICTED_ACROSS = 0.98, 0.6, 1.5
+_FEWEST_MORE_PREDICTED, _MOST_PAIRS_ACROSS = 30, 100
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,8 +57,8 @@ class WeakLink:
     part0, part1 : tuple of str
         Photos, sorted; the larger part first.
     strength : float
-        Explained matches of the strongest pair across, over those of the second-strongest pair of the photo
-        of it that has fewer.
+        Explained matches of the strongest pair across, over the verified matches of the second-strongest pair
+        of either of its photos, whichever has fewer; 0 if the model explains half of no pair across.
     """
 
     part0: tuple[str, ...]
@@ -158,9 +156,9 @@ def put_together_again(
     Returns
     -------
     pycolmap.Reconstruction or None
-        None if no part hangs by little, or each is where most verified matches or most points say, or another
-        place explains less, predicts not clearly more across, or is a fold. Photos that hang by even less are
-        left out, up to half of all.
+        None if no part hangs by little, or where each is explains half of the verified matches across, or no
+        other place that points agree about explains as much, predicts clearly more across, and is no fold.
+        Photos that hang by even less are left out, up to half of all.
 
     Raises
     ------
@@ -172,19 +170,23 @@ def put_together_again(
     moved: list[pycolmap.Reconstruction] = []
     # Parts of parts first.
     for link in weak_links(explained)[:_MAX_LINKS][::-1]:
+        if time.monotonic() > end:
+            break
         a, b = (_moved_or_as_is(part, moved, model) for part in (link.part0, link.part1))
         stayed = not any(one is a or one is b for one in moved)
         if stayed and _across(explained, link).is_enough:
             continue
         candidates = candidates_of(a, b, database, evidence.features)
+        # What was moved inside a part that then finds no place is given up.
+        moved = [one for one in moved if one is not a and one is not b]
         for placement in find_placements(a, b, candidates, num=_MAX_PLACEMENTS, seed=seed):
-            if len(placement.same_points) < _FEWEST_POINTS or (stayed and _is_as_before(placement, a, b)):
-                continue
             if time.monotonic() > end:
                 break
+            if len(placement.same_points) < _FEWEST_POINTS or (stayed and _is_as_before(placement, a, b)):
+                continue
             again = merge_models(a, b, placement, database, evidence, options=options, seed=seed)
-            if _is_better(again, model, link, evidence):
-                moved = [one for one in moved if one is not a and one is not b] + [again]
+            if again is not None and _is_better(again, model, link, evidence, stayed=stayed):
+                moved.append(again)
                 break
     largest = max(moved, key=lambda one: one.num_reg_images(), default=None)
     enough = _LEAST_PHOTOS * model.num_reg_images()
@@ -222,24 +224,38 @@ def _centres(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
 
 
 def _is_better(
-    again: pycolmap.Reconstruction, model: pycolmap.Reconstruction, link: WeakLink, evidence: SceneEvidence
+    again: pycolmap.Reconstruction,
+    model: pycolmap.Reconstruction,
+    link: WeakLink,
+    evidence: SceneEvidence,
+    *,
+    stayed: bool,
 ) -> bool:
-    """Whether the joined parts explain what they did, predict clearly more across, and are no fold."""
-    views = views_of(again)
-    views_before = views_of(_part(model, tuple(views)))
-    if views.keys() != views_before.keys() or not has_possible_cameras(again):
+    """Whether the joined parts explain what they did, predict clearly more across, and are no fold.
+
+    Parts that did not stay as they were need not predict more: the place of the whole may have been right.
+    """
+    before = _part(model, tuple(views_of(again)))
+    views, views_before = views_of(again), views_of(before)
+    if views.keys() != views_before.keys():
         return False
-    explained, before = (evidence.explain(one) for one in (views, views_before))
-    across, across_before = (_across(one, link).num_explained for one in (explained, before))
-    within, within_before = explained.num_explained - across, before.num_explained - across_before
+    explained, explained_before = (evidence.explain(one) for one in (views, views_before))
+    across, across_before = (_across(one, link).num_explained for one in (explained, explained_before))
+    within, within_before = explained.num_explained - across, explained_before.num_explained - across_before
     if within < _LEAST_EXPLAINED_WITHIN * within_before or across < _LEAST_EXPLAINED_ACROSS * across_before:
         return False
     predicted, predicted_before = (_predicted_across(one, link, evidence) for one in (views, views_before))
-    if _num(predicted) < _LEAST_PREDICTED_ACROSS * _num(predicted_before):
+    num, num_before = _num(predicted), _num(predicted_before)
+    more = max(_LEAST_PREDICTED_ACROSS * num_before, num_before + _FEWEST_MORE_PREDICTED)
+    if num < (more if stayed else num_before):
         return False
     # A fold predicts much across, too: it is betrayed by what photos side by side do not share. That pairs
     # across are not verified is no sign of one; what counts is what the joined model finds.
-    return not judge_model(again, {**predicted, **evidence.verified}).evidence.folded
+    folds, folds_before = (
+        judge_model(one, {**found, **evidence.verified}).evidence
+        for one, found in ((again, predicted), (before, predicted_before))
+    )
+    return not folds.folded or folds.value < folds_before.value
 
 
 def _num(matches: Mapping[Pair, NDArray[np.int32]]) -> int:
@@ -267,5 +283,8 @@ def _across(explained: Explained, link: WeakLink) -> _Across:
 
 
 def _predicted_across(views: Views, link: WeakLink, evidence: SceneEvidence) -> dict[Pair, NDArray[np.int32]]:
-    predicted = evidence.predicted(views)
-    return {pair: matches for pair, matches in predicted.items() if link.connects(*pair)}
+    """Matches that a model predicts across; of large parts, for a sample of the pairs, always the same."""
+    pairs = [(min(pair), max(pair)) for pair in itertools.product(link.part0, link.part1)]
+    if len(pairs) > _MOST_PAIRS_ACROSS:
+        pairs = random.Random(0).sample(pairs, _MOST_PAIRS_ACROSS)
+    return evidence.predicted(views, pairs)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,7 +103,7 @@ def candidates_of(
 
 def find_placements(
     a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, candidates: Candidates, *, num: int, seed: int = 0
-) -> list[Placement]:
+) -> Iterator[Placement]:
     """Similarities between two models that most of what may be the same point agrees with.
 
     Parameters
@@ -115,23 +115,21 @@ def find_placements(
         Placements at most. The second is what most of those say that disagree with the first, and so on.
     seed : int
 
-    Returns
-    -------
-    list of Placement
-        Not necessarily with many points.
+    Yields
+    ------
+    Placement
+        Found when it is asked for; not necessarily with many points.
     """
     longest = float(np.median([max(camera.width, camera.height) for camera in a.cameras.values()]))
     max_error_px = max(_LEAST_ERROR_PX, _MAX_ERROR_SHARE * longest)
-    placements: list[Placement] = []
-    while len(placements) < num:
+    for _ in range(num):
         side_a, side_b = (_observed(model, rows) for model, rows in ((a, candidates.a), (b, candidates.b)))
         found = find_similarity(side_a, side_b, max_error_px=max_error_px, seed=seed)
         if found is None:
-            break
+            return
         a_from_b, agreeing = found
-        placements.append(Placement(a_from_b=a_from_b, same_points=candidates.same_points(agreeing)))
+        yield Placement(a_from_b=a_from_b, same_points=candidates.same_points(agreeing))
         candidates = Candidates(a=candidates.a[~agreeing], b=candidates.b[~agreeing])
-    return placements
 
 
 def registered_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Image]:

@@ -71,9 +71,12 @@ class SceneEvidence:
         """Matches that a model predicts; the neighbours of features are computed when first needed."""
         return sum(len(matches) for matches in self.predicted(views).values())
 
-    def predicted(self, views: Views) -> dict[Pair, NDArray[np.int32]]:
-        """The same matches, (K, 2) keypoint indices for each pair of registered photos that is counted."""
-        return predict(views, self.keypoints, self._tables, self._pairs)
+    def predicted(self, views: Views, pairs: Sequence[Pair] | None = None) -> dict[Pair, NDArray[np.int32]]:
+        """The same matches, (K, 2) keypoint indices for each pair of registered photos that is counted.
+
+        Those are the pairs that `count_predicted` sums over, unless others are given.
+        """
+        return predict(views, self.keypoints, self._tables, self._pairs if pairs is None else pairs)
 
     def features(self, photo: str) -> Features:
         """Keypoints and descriptors of a photo."""

@@ -131,7 +131,7 @@ def test_all_that_the_round_of_a_stand_in_mapped_is_chosen_from(
 def test_all_attempts_to_unfold_share_half_of_the_time_for_other_models(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clock = itertools.count(start=0, step=40)
+    clock = itertools.count(start=0, step=10)
     monkeypatch.setattr(budget, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     bounds, outcomes = [], []
 
@@ -140,16 +140,17 @@ def test_all_attempts_to_unfold_share_half_of_the_time_for_other_models(
         return scene.truth
 
     def try_unfolding(first: object, verified: object, map_without: Any, *, rules: object) -> list:
-        outcomes.extend(map_without([]) for _ in range(3))
+        outcomes.extend(map_without([]) for _ in range(7))
         return []
 
     monkeypatch.setattr(unfolding, "map_candidate", map_candidate)
     monkeypatch.setattr(unfolding, "try_unfolding", try_unfolding)
     assert scene.select(scene.truth) is not None
-    # One step of the clock went to looking for parts in the wrong place.
-    half = round((policy_for(8, 1.0).max_time_factor + 1 - 40) / 2)
-    assert bounds == [half, half - 40]
-    assert outcomes == [scene.truth, scene.truth, None]
+    # Three steps of the clock went to looking for parts in the wrong place.
+    half = round((policy_for(8, 1.0).max_time_factor + 1 - 30) / 2)
+    assert bounds == list(range(half, 0, -10))
+    assert outcomes == [scene.truth] * len(bounds) + [None] * (7 - len(bounds))
+    assert 0 < len(bounds) < 7
 
 
 def test_candidates_hold_intrinsics_as_the_first_model_did(

@@ -1,15 +1,17 @@
 """A part that stands in the wrong place is put where most points say; one that stands right stays."""
 
+import copy
 import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pycolmap
 import pytest
 from two_parts import make_two_parts
 
-from corrsfm.reconstruction import mending, parts
+from corrsfm.reconstruction import joining, mending, parts
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
 from corrsfm.reconstruction.explained import Explained, ExplainedPair
 from corrsfm.reconstruction.joining import join_models
@@ -109,6 +111,92 @@ def test_a_part_where_most_verified_matches_across_say_is_not_moved(tmp_path: Pa
     assert put_together_again(model, found, made.database, made.evidence) is not None
 
 
+def with_a_camera_each(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The same model with a camera for each photo; only the first has the one of the database."""
+    camera_ids = {
+        image_id: image_id if image_id == 1 else 100 + image_id for image_id in sorted(model.images)
+    }
+    separate = pycolmap.Reconstruction()
+    for camera_id in camera_ids.values():
+        camera = copy.deepcopy(model.cameras[1])
+        camera.camera_id = camera_id
+        separate.add_camera_with_trivial_rig(camera)
+    for image_id, image in sorted(model.images.items()):
+        keypoints = np.array([point.xy for point in image.points2D])
+        own = pycolmap.Image(
+            name=image.name, keypoints=keypoints, camera_id=camera_ids[image_id], image_id=image_id
+        )
+        separate.add_image_with_trivial_frame(own, image.cam_from_world())
+    for _, point in sorted(model.points3D.items()):
+        track = pycolmap.Track()
+        for element in point.track.elements:
+            track.add_element(element)
+        separate.add_point3D(point.xyz, track, point.color)
+    return separate
+
+
+def test_photos_with_cameras_of_their_own_of_which_one_is_in_no_part(tmp_path: Path) -> None:
+    made = make_two_parts(
+        tmp_path / "d.db", angles_deg=(range(0, 60, 10), range(60, 110, 10)), num_common_points=60
+    )
+    model = with_a_camera_each(as_one(*made.models))
+    found = made.evidence.explain(views_of(model))
+    pairs = tuple(pair for pair in found.pairs if "a5.jpg" not in (pair.name0, pair.name1))
+    again = put_together_again(
+        model, Explained(pairs=pairs, registered=found.registered), made.database, made.evidence
+    )
+    assert again is not None and len(views_of(again)) == 10
+    assert relative_pose_differences_deg(views_of(again), views_of(made.truth)).max() < 2.0
+
+
+def test_a_place_that_gives_impossible_cameras_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+
+    def refine(model: pycolmap.Reconstruction, options: object) -> None:
+        model.cameras[1].params = [-3.0, *model.cameras[1].params[1:]]
+
+    monkeypatch.setattr(joining, "refine", refine)
+    model = as_one(*made.models)
+    found = made.evidence.explain(views_of(model))
+    assert put_together_again(model, found, made.database, made.evidence) is None
+    _, (attempt,) = join_models(made.models, made.database, made.evidence)
+    assert not attempt.is_joined and "a camera that cannot be" in attempt.reason
+
+
+def test_a_few_predicted_matches_more_are_no_reason_to_move_a_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    model = as_one(*made.models)
+    found = made.evidence.explain(views_of(model))
+    monkeypatch.setattr(made.evidence, "predicted", lambda views, pairs=None: {})
+    assert put_together_again(model, found, made.database, made.evidence) is None
+
+
+def test_a_part_of_a_part_is_moved_and_what_stood_right_stays(tmp_path: Path) -> None:
+    made = make_two_parts(
+        tmp_path / "d.db", angles_deg=(range(0, 60, 10), range(60, 160, 10)), num_common_points=60
+    )
+    (right,), _ = join_models(made.models, made.database, made.evidence)
+    far = tuple(f"b{number}.jpg" for number in (7, 8, 9))
+    rest = pycolmap.Reconstruction(right)
+    moved = pycolmap.Reconstruction(right)
+    for image in list(right.images.values()):
+        (rest if image.name in far else moved).deregister_frame(image.frame_id)
+    moved.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(np.array([0.0, 1.2, 0.0])), [2.0, 0.0, 1.0]))
+    wrong = as_one(rest, moved)
+    for pair in list(made.evidence.verified):
+        if (pair[0] in far) != (pair[1] in far):
+            del made.evidence.verified[pair]
+    links = [len(link.part1) for link in weak_links(made.evidence.explain(views_of(wrong)))]
+    assert links == [3, 6]
+    again = put_together_again(wrong, made.evidence.explain(views_of(wrong)), made.database, made.evidence)
+    assert again is not None and len(views_of(again)) == 16
+    assert relative_pose_differences_deg(views_of(again), views_of(made.truth)).max() < 1.0
+
+
 def test_no_other_place_is_tried_once_the_time_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,7 +236,7 @@ def test_photos_that_fell_out_are_registered_again(tmp_path: Path, monkeypatch: 
     without.deregister_frame(without.find_image_with_name("a5.jpg").frame_id)
     monkeypatch.setattr(mending, "put_together_again", lambda *_, **__: without)
     mender = Mender(made.evidence, made.database, tmp_path / "work")
-    mended = mender.mend(whole, made.evidence.explain(views_of(whole)))
+    mended = mender.put_parts(whole, made.evidence.explain(views_of(whole)))
     assert mended is not None
     assert relative_pose_differences_deg(views_of(mended), views_of(made.truth)).max() < 0.6
     assert len(views_of(mended)) == 6
