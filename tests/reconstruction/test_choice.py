@@ -160,6 +160,29 @@ def test_the_best_of_each_round_is_mended_once() -> None:
     assert [model.name for model in choice.tried][:3] == ["a", "a mended", "b"]
 
 
+@pytest.mark.parametrize(("first", "mended", "chosen"), [(BENT, RIGHT, "m"), (RIGHT, BENT, "a")])
+def test_a_first_model_and_what_mending_made_of_it_are_compared_first(
+    first: dict[str, View], mended: dict[str, View], chosen: str
+) -> None:
+    choice = choose_model(
+        tried("a", first), [None], num_photos=4, map_round=lambda _: pytest.fail("mapped a candidate"),
+        count_predicted=count, policy=POLICY, mended=tried("m", mended),
+    )  # fmt: skip
+    assert choice.chosen.name == chosen and choice.support is None
+    assert [model.name for model in choice.tried] == ["a", "m"]
+    assert choice.reason == "the first model, mended, is good enough"
+
+
+def test_of_two_bent_models_others_are_tried() -> None:
+    choice = choose_model(
+        tried("a", BENT), [tried("c", RIGHT)], num_photos=4, map_round=lambda round_: round_,
+        count_predicted=count, policy=POLICY, mended=tried("m", BENT_OTHERWISE),
+        others=[tried("u", BENT), None],
+    )  # fmt: skip
+    assert choice.chosen.name == "c" and choice.num_failed == 1
+    assert [model.name for model in choice.tried] == ["a", "m", "u", "c"]
+
+
 def test_mending_that_gives_nothing_is_not_repeated() -> None:
     asked: list[str] = []
     choice = choose_model(
