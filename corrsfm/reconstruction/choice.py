@@ -211,7 +211,7 @@ def choose_model(
         counts = [model for model in outcomes if model is not None]
         best = _best(counts[:2])
         if good_enough(best, num_photos, policy):
-            reason = "the first model, mended, is good enough"
+            reason = f"the first model{', mended,' if best.name != first.name else ''} is good enough"
             return Choice(chosen=best, tried=tuple(counts), reason=reason)
     mend_best(outcomes)
     affordable = bank[: max(policy.max_models - len(outcomes), 0)]
