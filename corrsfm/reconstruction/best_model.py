@@ -202,7 +202,8 @@ def select_model(
             # It may have more to mend.
             cameras_of[name], left_out[name] = cameras, left_out.get(model.name, ())
             outcome = tried(name, again, spent(), way=model.way, has_more_cameras=model.has_more_cameras)
-            return dataclasses.replace(outcome, is_open=model.is_open)
+            put = way == mender.put_parts or model.is_put_together
+            return dataclasses.replace(outcome, is_open=model.is_open, is_put_together=put)
 
         start, others = None, []
         if first is not None:

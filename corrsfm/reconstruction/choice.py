@@ -83,6 +83,8 @@ class Tried:
         It has a camera for each photo, and other candidates share one.
     has_more_cameras : bool
         It has more cameras than other candidates.
+    is_put_together : bool
+        Parts of it stood elsewhere, and most points of all pairs put them where they are.
     num_predicted : int or None
         None until a choice has to be made.
     """
@@ -94,6 +96,7 @@ class Tried:
     seconds: float
     is_open: bool = False
     has_more_cameras: bool = False
+    is_put_together: bool = False
     num_predicted: int | None = None
 
     @property
@@ -123,8 +126,9 @@ class Choice:
         Why no more was tried, as the end of "stopped because …".
     support : float or None
         Best agreement of another candidate with the chosen one, among those that were mapped in another way
-        and predict nearly as much: share of relative poses in [0, 1]. None if only the first model was looked
-        at, 0 if the others predict less.
+        and predict nearly as much: share of relative poses in [0, 1]; 0 if the others predict less. None if
+        the chosen model needs no confirmation: a first model that is good enough, or one that was put
+        together again and is.
     could_try_more : bool
         Whether a larger `ChoicePolicy.max_models` would have brought another candidate.
     """
@@ -221,7 +225,7 @@ def choose_model(
     for candidates in _rounds(affordable, policy.round_size):
         outcomes += [None if model is None else counted(model) for model in map_round(candidates)]
         mend_best(outcomes)
-        if why := _why_stop(outcomes, policy):
+        if why := _why_stop(outcomes, num_photos, policy):
             reason, could_try_more = why, False
             break
     tried = [model for model in outcomes if model is not None]
@@ -231,7 +235,9 @@ def choose_model(
         tried=tuple(tried),
         num_failed=len(outcomes) - len(tried),
         reason=reason,
-        support=_support(best, tried, policy.confirming_predicted),
+        support=None
+        if _needs_no_other(best, num_photos, policy)
+        else _support(best, tried, policy.confirming_predicted),
         could_try_more=could_try_more,
     )
 
@@ -240,10 +246,17 @@ def _rounds(bank: Sequence[C], size: int) -> Iterator[Sequence[C]]:
     return (bank[start : start + size] for start in range(0, len(bank), size))
 
 
-def _why_stop(outcomes: Sequence[Tried | None], policy: ChoicePolicy) -> str:
+def _needs_no_other(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
+    """Whether a model that was put together again is as good as a first one must be to need no second."""
+    return model.is_put_together and good_enough(model, num_photos, policy)
+
+
+def _why_stop(outcomes: Sequence[Tried | None], num_photos: int, policy: ChoicePolicy) -> str:
     """Why no further candidate is needed; empty if one is."""
     tried = [model for model in outcomes if model is not None]
     best = _best(tried)
+    if _needs_no_other(best, num_photos, policy):
+        return "the best model, mended, is good enough"
     support = _support(best, tried, policy.confirming_predicted)
     share = best.explained.share_of_supported
     if not best.explained.misplaced:

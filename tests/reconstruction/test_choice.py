@@ -173,6 +173,23 @@ def test_a_first_model_and_what_mending_made_of_it_are_compared_first(
     assert choice.reason == f"the first model{', mended,' if chosen == 'm' else ''} is good enough"
 
 
+@pytest.mark.parametrize("is_put_together", [True, False])
+def test_a_candidate_that_was_put_together_again_needs_no_confirmation(is_put_together: bool) -> None:
+    def mend(model: Tried) -> Tried | None:
+        put = dataclasses.replace(tried("m", RIGHT), is_put_together=is_put_together)
+        return put if model.name == "b" else None
+
+    bank = [tried("b", BENT_OTHERWISE), None, tried("c", BENT), None]
+    choice = choose_model(
+        dataclasses.replace(tried("a", BENT), views={}), bank, num_photos=4, count_predicted=count,
+        map_round=lambda round_: round_, policy=POLICY, mend=mend,
+    )  # fmt: skip
+    assert choice.chosen.name == "m"
+    assert choice.support == (None if is_put_together else 0.0)
+    assert len(choice.tried) == (3 if is_put_together else 4)
+    assert ("mended, is good enough" in choice.reason) == is_put_together
+
+
 def test_of_two_bent_models_others_are_tried() -> None:
     choice = choose_model(
         tried("a", BENT), [tried("c", RIGHT)], num_photos=4, map_round=lambda round_: round_,
