@@ -13,10 +13,14 @@ from two_parts import make_two_parts
 
 from corrsfm.reconstruction import joining, mending, parts
 from corrsfm.reconstruction.agreement import relative_pose_differences_deg
+from corrsfm.reconstruction.best_model import select_model
+from corrsfm.reconstruction.budget import policy_for
 from corrsfm.reconstruction.explained import Explained, ExplainedPair
 from corrsfm.reconstruction.joining import join_models
 from corrsfm.reconstruction.mending import Mender
 from corrsfm.reconstruction.parts import put_together_again, weak_links
+from corrsfm.reconstruction.pool import CandidatePool
+from corrsfm.reconstruction.verdict import Grade
 from corrsfm.reconstruction.views import views_of
 from corrsfm.types import Pair
 
@@ -208,6 +212,21 @@ def test_no_other_place_is_tried_once_the_time_is_over(
     given = model, found, made.database, made.evidence
     assert put_together_again(*given, max_runtime_seconds=5) is None
     assert put_together_again(*given) is not None
+
+
+def test_a_first_model_with_a_part_in_the_wrong_place_is_mended_and_nothing_else_is_mapped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = make_two_parts(tmp_path / "d.db", angles_deg=NEXT_TO, num_common_points=60)
+    monkeypatch.setattr(CandidatePool, "map", lambda *_, **__: pytest.fail("mapped a candidate"))
+    selected = select_model(
+        as_one(*made.models), made.evidence, made.database, tmp_path / "work",
+        policy=policy_for(8, 1.0), first_seconds=1.0,
+    )  # fmt: skip
+    assert selected is not None and selected.choice.chosen.name == "first+mended"
+    assert [model.name for model in selected.choice.tried] == ["first", "first+mended"]
+    assert relative_pose_differences_deg(views_of(selected.model), views_of(made.truth)).max() < 0.6
+    assert selected.verdict.grade is Grade.GOOD
 
 
 def test_parts_in_their_right_places_stay(tmp_path: Path) -> None:
