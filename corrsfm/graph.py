@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from collections import defaultdict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from corrsfm.errors import first_few
 from corrsfm.types import Pair
 
-__all__ = ["MAX_NAMED_GROUPS", "connected_components", "describe_components", "neighbours_together"]
+__all__ = [
+    "MAX_NAMED_GROUPS",
+    "connected_components",
+    "describe_components",
+    "neighbours_together",
+    "second_strongest",
+]
 
 
 MAX_NAMED_GROUPS = 5
@@ -47,6 +53,15 @@ def describe_components(names: Sequence[str], pairs: Iterable[Pair]) -> str:
     for group in components[1 : 1 + MAX_NAMED_GROUPS]:
         lines.append(f"not connected to the largest group: {first_few(group)}")
     return "\n".join(lines)
+
+
+def second_strongest(strengths: Mapping[Pair, int]) -> dict[str, int]:
+    """Strength of the second-strongest pair of each photo; 0 for photos of one pair."""
+    own = defaultdict(list)
+    for pair, strength in strengths.items():
+        for name in pair:
+            own[name].append(strength)
+    return {name: sorted(values)[-2] if len(values) > 1 else 0 for name, values in own.items()}
 
 
 def neighbours_together(pairs: Iterable[Pair]) -> list[Pair]:

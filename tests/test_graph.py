@@ -2,7 +2,12 @@
 
 import numpy as np
 
-from corrsfm.graph import neighbours_together
+from corrsfm.graph import neighbours_together, second_strongest
+
+
+def test_the_second_strongest_pair_of_a_photo_counts() -> None:
+    strengths = {("a", "b"): 9, ("a", "c"): 5, ("a", "d"): 7, ("b", "c"): 1}
+    assert second_strongest(strengths) == {"a": 7, "b": 1, "c": 1, "d": 0}
 
 
 def test_pairs_that_follow_each_other_share_photos_whatever_the_photos_are_called() -> None:

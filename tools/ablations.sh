@@ -50,6 +50,18 @@ side_channels = 5
 TOML
 }
 
+compare() { # what the results are called after ablation_, the names, and the kinds of pairs
+  local prefix=$1 names=$2 methods=(--method ratio0.8+mutual/poselib) name kind pairs
+  for name in $names; do methods+=(--method "oanet@pose:runs/ablation/$name/latest.pt/poselib"); done
+  methods+=(--method oanet@pose/poselib --method corradaptor@pose/poselib)
+  for kind in "${@:3}"; do
+    pairs=pairs/val_$kind.h5
+    [ "$kind" != 2000 ] || pairs=pairs/val.h5
+    corrsfm evaluate pose "$pairs" --max-per-scene 40 --threads 1 "${methods[@]}" \
+      --baseline oanet@pose:runs/ablation/base/latest.pt/poselib --results "results/ablation_$prefix$kind.json"
+  done
+}
+
 case ${1:-} in
 train)
   mkdir -p runs/ablation
@@ -58,28 +70,8 @@ train)
     corrsfm train run --config "runs/ablation/$name.toml" --threads 1 --resume
   done
   ;;
-val)
-  methods=(--method ratio0.8+mutual/poselib)
-  for name in "${names[@]}"; do methods+=(--method "oanet@pose:runs/ablation/$name/latest.pt/poselib"); done
-  methods+=(--method oanet@pose/poselib --method corradaptor@pose/poselib)
-  for keypoints in 4096 2000; do
-    pairs=pairs/val.h5
-    [ "$keypoints" = 2000 ] || pairs=pairs/val_4096.h5
-    corrsfm evaluate pose "$pairs" --max-per-scene 40 --threads 1 "${methods[@]}" \
-      --baseline oanet@pose:runs/ablation/base/latest.pt/poselib --results "results/ablation_$keypoints.json"
-  done
-  ;;
-data)
-  methods=(--method ratio0.8+mutual/poselib)
-  for name in base "${data[@]}"; do methods+=(--method "oanet@pose:runs/ablation/$name/latest.pt/poselib"); done
-  methods+=(--method oanet@pose/poselib --method corradaptor@pose/poselib)
-  for kind in 1000 2000 4096 8192 pycolmap; do
-    pairs="pairs/val_$kind.h5"
-    [ "$kind" != 2000 ] || pairs=pairs/val.h5
-    corrsfm evaluate pose "$pairs" --max-per-scene 40 --threads 1 "${methods[@]}" \
-      --baseline oanet@pose:runs/ablation/base/latest.pt/poselib --results "results/ablation_data_$kind.json"
-  done
-  ;;
+val) compare "" "${names[*]}" 4096 2000 ;;
+data) compare data_ "base ${data[*]}" 1000 2000 4096 8192 pycolmap ;;
 *)
   sed -n '2,13p' "$0" | sed 's/^# \{0,1\}//' >&2
   exit 2

@@ -23,7 +23,7 @@ from corrsfm.errors import CorrsfmError
 from corrsfm.evaluation.metrics import extent_of
 from corrsfm.evaluation.records import provenance, save_results
 from corrsfm.evaluation.scenes.score import read_poses
-from corrsfm.geometry import Pose, camera_centre
+from corrsfm.geometry import Pose, camera_centre, rotation_angle_deg
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from tools.whole_scenes import call, measure  # noqa: E402
@@ -78,8 +78,7 @@ def count_in_place(poses: Mapping[str, Pose], truth: Mapping[str, Pose]) -> int:
     turns = np.array([truth[name][0].T @ poses[name][0] for name in names])
     most = 0
     for i, turn in enumerate(turns):
-        trace = np.einsum("jk,mjk->m", turn, turns)
-        turned = np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+        turned = np.array([rotation_angle_deg(turn.T @ other) for other in turns])
         for j in range(len(names)):
             baseline, found_baseline = (np.linalg.norm(own[j] - own[i]) for own in (known, found))
             # Two cameras in one place would shrink everything to it.

@@ -230,9 +230,7 @@ def select_model(
                 best = unfold_model(attempt, evidence, database, workdir, seed, refinement, part)
             if best is not attempt:
                 unfolded = _tried_unfolded(best, evidence, spent())
-                if unfolded.explained.is_enough(unfolded.explained.share) or (
-                    unfolded.explained.is_enough_of_supported
-                ):
+                if unfolded.explained.explains_enough:
                     known = (one for one in (start, mended, *others) if one is not None)
                     return _selection_of(best, unfolded, tuple(known), len(evidence.names))
                 # Whatever the first model was, it was more than a fold.

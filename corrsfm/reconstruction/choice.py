@@ -147,7 +147,7 @@ def good_enough(model: Tried, num_photos: int, policy: ChoicePolicy) -> bool:
     return (
         not model.is_open
         and not explained.misplaced
-        and (explained.is_enough(explained.share) or explained.is_enough_of_supported)
+        and explained.explains_enough
         and model.num_registered >= policy.min_registered_share * num_photos
     )
 

@@ -118,6 +118,11 @@ class Explained:
         few = self.are_contradicted_within(MOST_CONTRADICTED)
         return few and self.share_of_supported >= ENOUGH_SUPPORTED_SHARE
 
+    @property
+    def explains_enough(self) -> bool:
+        """Whether enough of all pairs is explained, or of those that are not contradicted."""
+        return self.is_enough(self.share) or self.is_enough_of_supported
+
     def are_contradicted_within(self, share: float) -> bool:
         """Whether contradicted pairs hold at most this share of the verified matches of registered photos."""
         num_verified = sum(pair.num_verified for pair in self.pairs if pair.is_registered)

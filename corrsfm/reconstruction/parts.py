@@ -13,7 +13,6 @@ import itertools
 import math
 import random
 import time
-from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +21,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.geometry import rotation_angle_deg
+from corrsfm.graph import second_strongest
 from corrsfm.reconstruction.calibration import DEFAULT_REFINEMENT, Refinement, adjustment_options
 from corrsfm.reconstruction.explained import Explained
 from corrsfm.reconstruction.folds.unfold import judge_model
 from corrsfm.reconstruction.joining import merge_models
+from corrsfm.reconstruction.registration import without_photos
 from corrsfm.reconstruction.same_points import Placement, candidates_of, find_placements
 from corrsfm.reconstruction.scene_evidence import SceneEvidence
 from corrsfm.reconstruction.views import Views, views_of
@@ -81,20 +83,14 @@ def weak_links(explained: Explained) -> list[WeakLink]:
     list of WeakLink
         The weakest first.
     """
-    held: dict[Pair, int] = {}
-    counts: dict[str, list[int]] = defaultdict(list)
-    for one in explained.pairs:
-        if one.is_registered and one.num_verified:
-            counts[one.name0].append(one.num_verified)
-            counts[one.name1].append(one.num_verified)
-            if not one.is_contradicted:
-                held[one.name0, one.name1] = one.num_explained
-    second = {name: sorted(numbers)[-2] if len(numbers) > 1 else 0 for name, numbers in counts.items()}
+    there = {(one.name0, one.name1): one for one in explained.pairs if one.is_registered and one.num_verified}
+    held = {pair: one.num_explained for pair, one in there.items() if not one.is_contradicted}
+    second = second_strongest({pair: one.num_verified for pair, one in there.items()})
     strength = {
         pair: num / least if (least := min(second[pair[0]], second[pair[1]])) else np.inf
         for pair, num in held.items()
     }
-    parts = {name: [name] for name in counts}
+    parts = {name: [name] for name in second}
     links = []
     # From the strongest pair down, as the greatest spanning tree is built.
     for pair in sorted(held, key=lambda one: (-strength[one], one)):
@@ -202,17 +198,13 @@ def _moved_or_as_is(
 
 
 def _part(model: pycolmap.Reconstruction, names: tuple[str, ...]) -> pycolmap.Reconstruction:
-    part = pycolmap.Reconstruction(model)
-    for image in list(part.images.values()):
-        if image.has_pose and image.name not in names:
-            part.deregister_frame(image.frame_id)
-    return part
+    return without_photos(model, {image.name for image in model.images.values()} - set(names))
 
 
 def _is_as_before(placement: Placement, a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> bool:
     """Whether a placement hardly turns part b, nor moves its photos by much of the extent of both."""
     a_from_b = placement.a_from_b
-    turn = np.degrees(np.arccos(np.clip((np.trace(a_from_b.rotation) - 1) / 2, -1, 1)))
+    turn = rotation_angle_deg(a_from_b.rotation)
     centres = _centres(b)
     distances = np.linalg.norm(a_from_b.apply(centres) - centres, axis=1)
     extent = np.linalg.norm(np.ptp(np.vstack([_centres(a), centres]), axis=0))
@@ -235,8 +227,9 @@ def _is_better(
 
     Parts that did not stay as they were need not predict more: the place of the whole may have been right.
     """
-    before = _part(model, tuple(views_of(again)))
-    views, views_before = views_of(again), views_of(before)
+    views = views_of(again)
+    before = _part(model, tuple(views))
+    views_before = views_of(before)
     if views.keys() != views_before.keys():
         return False
     explained, explained_before = (evidence.explain(one) for one in (views, views_before))
@@ -251,11 +244,10 @@ def _is_better(
         return False
     # A fold predicts much across, too: it is betrayed by what photos side by side do not share. That pairs
     # across are not verified is no sign of one; what counts is what the joined model finds.
-    folds, folds_before = (
-        judge_model(one, {**found, **evidence.verified}).evidence
-        for one, found in ((again, predicted), (before, predicted_before))
-    )
-    return not folds.folded or folds.value < folds_before.value
+    folds = judge_model(again, {**predicted, **evidence.verified}).evidence
+    if not folds.folded:
+        return True
+    return folds.value < judge_model(before, {**predicted_before, **evidence.verified}).evidence.value
 
 
 def _num(matches: Mapping[Pair, NDArray[np.int32]]) -> int:

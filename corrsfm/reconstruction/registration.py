@@ -25,7 +25,16 @@ from corrsfm.reconstruction.candidates import (
     largest_possible,
 )
 
-__all__ = ["register_again"]
+__all__ = ["register_again", "without_photos"]
+
+
+def without_photos(model: pycolmap.Reconstruction, names: Collection[str]) -> pycolmap.Reconstruction:
+    """A copy of a model without the poses of some photos, and without what only they see."""
+    rest = pycolmap.Reconstruction(model)
+    for image in list(rest.images.values()):
+        if image.has_pose and image.name in names:
+            rest.deregister_frame(image.frame_id)
+    return rest
 
 
 def register_again(
@@ -73,10 +82,7 @@ def register_again(
     DatabaseError
         If the database cannot be read.
     """
-    rest = pycolmap.Reconstruction(model)
-    for image in list(rest.images.values()):
-        if image.has_pose and image.name in names:
-            rest.deregister_frame(image.frame_id)
+    rest = without_photos(model, names)
     if rest.num_reg_images() < 2:
         return None
     original = database

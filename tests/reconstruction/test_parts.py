@@ -82,10 +82,7 @@ def as_one(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction) -> pycolmap.R
             frame.set_cam_from_world(image.camera_id, image.cam_from_world())
             whole.register_frame(frame.frame_id)
     for _, point in sorted(b.points3D.items()):
-        track = pycolmap.Track()
-        for element in point.track.elements:
-            track.add_element(element)
-        whole.add_point3D(point.xyz, track, point.color)
+        whole.add_point3D(point.xyz, point.track, point.color)
     return whole
 
 
@@ -132,10 +129,7 @@ def with_a_camera_each(model: pycolmap.Reconstruction) -> pycolmap.Reconstructio
         )
         separate.add_image_with_trivial_frame(own, image.cam_from_world())
     for _, point in sorted(model.points3D.items()):
-        track = pycolmap.Track()
-        for element in point.track.elements:
-            track.add_element(element)
-        separate.add_point3D(point.xyz, track, point.color)
+        separate.add_point3D(point.xyz, point.track, point.color)
     return separate
 
 

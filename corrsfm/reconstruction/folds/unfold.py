@@ -15,6 +15,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from corrsfm.graph import second_strongest
 from corrsfm.reconstruction.folds.bodies import outvoted_pairs, rotation_votes
 from corrsfm.reconstruction.folds.evidence import FoldEvidence, NearPair, fold_evidence
 from corrsfm.reconstruction.folds.sightings import Sightings, explained_shares, read_sightings
@@ -186,11 +187,7 @@ def weak_pairs(
 
     Whichever of the two second-strongest pairs is weaker counts; a photo's only pair always stays. Sorted.
     """
-    counts: dict[str, list[int]] = {}
-    for pair, matches in verified.items():
-        for name in pair:
-            counts.setdefault(name, []).append(len(matches))
-    second = {name: sorted(numbers)[-2] if len(numbers) > 1 else 0 for name, numbers in counts.items()}
+    second = second_strongest({pair: len(matches) for pair, matches in verified.items()})
     return tuple(
         sorted(
             pair
